@@ -1,0 +1,1 @@
+"""The window kernel. The C sources under ``cpu/`` are compiled into the runtime."""

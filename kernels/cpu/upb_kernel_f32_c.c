@@ -1,0 +1,106 @@
+/* The window kernel in plain C: the reference that every other one is checked against, and the fallback. */
+#include <math.h>
+
+#include "upb_kernels.h"
+
+static float pick_valid(const upb_model_f32 *model, uint16_t distance, float value) {
+    return (float)distance >= model->min_count && (float)distance <= model->max_count ? value : 0.0f;
+}
+
+static void prepare_f32_c(upb_prepared_f32 *prepared, const upb_model_f32 *model, const uint16_t *distance,
+                          const uint8_t *intensity) {
+    float d[UPB_LANES + 1], i[UPB_LANES + 1];
+    for (unsigned k = 0; k < UPB_LANES; k++) {
+        d[k] = pick_valid(model, distance[k], (float)distance[k]);
+        i[k] = pick_valid(model, distance[k], (float)intensity[k]);
+    }
+    d[UPB_LANES] = i[UPB_LANES] = 0.0f;
+    for (unsigned k = 0; k < UPB_LANES; k++) {
+        /* Intensities are filled in the same places as distances: a measured intensity may be 0. */
+        unsigned top = model->fill && d[k] == 0.0f ? k + 1 : k;
+        unsigned bottom = model->fill && d[k + 1] == 0.0f ? k : k + 1;
+        prepared->row[UPB_DISTANCE_TOP][k] = d[top];
+        prepared->row[UPB_DISTANCE_BOTTOM][k] = d[bottom];
+        prepared->row[UPB_INTENSITY_TOP][k] = i[top];
+        prepared->row[UPB_INTENSITY_BOTTOM][k] = i[bottom];
+    }
+}
+
+static float least(float a, float b) { return a < b ? a : b; }
+
+/* Fills the empty ones of three neighbours: x is one row of a window, `empty` tells of its columns. */
+static void fill_columns(float x[3], const int empty[3]) {
+    const float left = x[0], middle = x[1], right = x[2];
+    if (empty[0])
+        x[0] = empty[1] ? right : middle;
+    if (empty[2])
+        x[2] = empty[1] ? left : middle;
+    if (empty[1])
+        x[1] = empty[0] ? right : empty[2] ? left : least(left, right);
+}
+
+/* The window of lane k: x[0..2] top row, x[3..5] bottom row, x[6] minimum; `first` is the top row of a prepared column. */
+static void gather(float x[UPB_TAPS], const upb_model_f32 *model, const upb_prepared_f32 *const column[3], int first,
+                   unsigned k) {
+    int empty[3];
+    for (int c = 0; c < 3; c++) {
+        x[c] = column[c]->row[first][k];
+        x[3 + c] = column[c]->row[first + 1][k];
+        empty[c] = column[c]->row[UPB_DISTANCE_TOP][k] == 0.0f; /* the pair is filled: its top tells for both */
+    }
+    if (model->fill) {
+        fill_columns(x, empty);
+        fill_columns(x + 3, empty);
+    }
+    x[6] = x[0];
+    for (int i = 1; i < 6; i++)
+        x[6] = least(x[6], x[i]);
+}
+
+static float network(const upb_network_f32 *net, const float x[UPB_TAPS]) {
+    float y = net->offset + net->skip * x[6];
+    for (uint32_t h = 0; h < net->hidden; h++) {
+        const float *unit = net->unit[h];
+        float sum = unit[UPB_UNIT_BIAS];
+        for (int i = 0; i < UPB_TAPS; i++)
+            sum += unit[i] * x[i];
+        float bent = net->slope * sum;
+        y += unit[UPB_UNIT_OUTPUT] * (sum > bent ? sum : bent);
+    }
+    return net->positive && y < 0.0f ? 0.0f : y;
+}
+
+static void windows_f32_c(const upb_model_f32 *model, const upb_prepared_f32 *left, const upb_prepared_f32 *middle,
+                          const upb_prepared_f32 *right, uint16_t *distance, uint8_t *intensity) {
+    const upb_prepared_f32 *const column[3] = {left, middle, right};
+    for (unsigned k = 0; k < UPB_LANES; k++) {
+        float x[UPB_TAPS];
+        gather(x, model, column, UPB_DISTANCE_TOP, k);
+        float d = floorf(network(&model->network[UPB_DISTANCE], x) + 0.5f);
+        int seen = !model->fill || x[0] != 0.0f; /* filled: 0 only if the whole window is empty */
+        int given = seen && d >= model->min_count && d <= model->max_count;
+        gather(x, model, column, UPB_INTENSITY_TOP, k);
+        float i = floorf(network(&model->network[UPB_INTENSITY], x) + 0.5f);
+        i = i < 0.0f ? 0.0f : i > 255.0f ? 255.0f : i; /* before the conversion: it may not fit an integer */
+        distance[k] = given ? (uint16_t)d : 0;
+        intensity[k] = given ? (uint8_t)i : 0;
+    }
+}
+
+static void raw_f32_c(const upb_model_f32 *model, const upb_prepared_f32 *left, const upb_prepared_f32 *middle,
+                      const upb_prepared_f32 *right, float *distance, float *intensity) {
+    const upb_prepared_f32 *const column[3] = {left, middle, right};
+    for (unsigned k = 0; k < UPB_LANES; k++) {
+        float x[UPB_TAPS];
+        gather(x, model, column, UPB_DISTANCE_TOP, k);
+        distance[k] = network(&model->network[UPB_DISTANCE], x);
+        gather(x, model, column, UPB_INTENSITY_TOP, k);
+        intensity[k] = network(&model->network[UPB_INTENSITY], x);
+    }
+}
+
+void upb_kernels_fill_c(upb_kernels *kernels) {
+    kernels->prepare_f32 = prepare_f32_c;
+    kernels->windows_f32 = windows_f32_c;
+    kernels->raw_f32 = raw_f32_c;
+}

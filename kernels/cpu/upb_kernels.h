@@ -1,0 +1,93 @@
+/*
+ * Window kernels on the CPU: internal interface between the column stream and one C file per instruction set.
+ *
+ * A column of 32 beams has 31 windows; window k lies between beams k and k+1. Windows are the lanes of the vectors: lane k
+ * of every array below is window k. Lane 31 is padding: it holds finite values of no meaning, and nobody reads its result.
+ *
+ * All distances are in counts (the sensor's units), all intensities in their 8-bit steps; the size of a count is folded
+ * into the weights when the model is loaded. The meaning of the rules is in docs/model-format.md.
+ */
+#ifndef UPB_KERNELS_H
+#define UPB_KERNELS_H
+
+#include <stdint.h>
+
+#include "upbeam/upbeam.h"
+
+#define UPB_LANES 32u /* UPB_WINDOWS and one lane of padding */
+#define UPB_TAPS 7    /* inputs of a network: six window pixels and their minimum */
+
+/* Places in a row of upb_network_f32.unit. */
+enum { UPB_UNIT_BIAS = UPB_TAPS, UPB_UNIT_OUTPUT = UPB_TAPS + 1, UPB_UNIT_FLOATS = 16 };
+
+/*
+ * One network, folded: y = offset + skip * min + sum over h of OUTPUT[h] * leaky(BIAS[h] + sum over i of unit[h][i] * x[i]).
+ * One hidden unit is one cache line: seven weights, bias, output weight, zeros.
+ * Values: finite, magnitudes below 1e11; slope 0..1. Inputs are at most 65535, so that no sum overflows.
+ */
+typedef struct upb_network_f32 {
+    _Alignas(UPB_ALIGN) float unit[UPB_MAX_HIDDEN][UPB_UNIT_FLOATS];
+    uint32_t hidden;   /* 1..UPB_MAX_HIDDEN */
+    uint32_t positive; /* not 0: the output is max(y, 0) */
+    float slope;       /* of the leaky rectifier */
+    float skip;        /* weight of the window minimum in the output */
+    float offset;
+} upb_network_f32;
+
+enum { UPB_DISTANCE = 0, UPB_INTENSITY = 1 };
+
+/* What a kernel needs of a model. */
+typedef struct upb_model_f32 {
+    upb_network_f32 network[2]; /* UPB_DISTANCE, UPB_INTENSITY */
+    float min_count;            /* 1..max_count, whole: nearest count that is seen and given */
+    float max_count;            /* at most 65535 */
+    uint32_t fill;              /* not 0: UPB_EMPTY_FILL */
+} upb_model_f32;
+
+/* Rows of a prepared column. Top is beam k, bottom beam k+1. */
+enum { UPB_DISTANCE_TOP, UPB_DISTANCE_BOTTOM, UPB_INTENSITY_TOP, UPB_INTENSITY_BOTTOM, UPB_PREPARED_ROWS };
+
+/*
+ * A column as windows see it: range limits applied (a pixel outside is 0, distance and intensity), and under
+ * UPB_EMPTY_FILL an empty pixel filled from the other one of its pair. Three of them side by side make the windows.
+ * Distances are 0 (empty) or min_count..max_count, intensities 0..255, all whole.
+ */
+typedef struct upb_prepared_f32 {
+    _Alignas(UPB_ALIGN) float row[UPB_PREPARED_ROWS][UPB_LANES];
+} upb_prepared_f32;
+
+/* distance: [UPB_BEAMS] counts, 0..65535; intensity: [UPB_BEAMS]; no alignment needed. */
+typedef void (*upb_prepare_f32_fn)(upb_prepared_f32 *prepared, const upb_model_f32 *model, const uint16_t *distance,
+                                   const uint8_t *intensity);
+
+/*
+ * Both networks on the 31 windows around `middle`. Writes UPB_LANES values to both outputs (no alignment needed): distance
+ * 0 or min_count..max_count, intensity 0..255 and 0 where the distance is 0. The three columns may be one and the same.
+ */
+typedef void (*upb_windows_f32_fn)(const upb_model_f32 *model, const upb_prepared_f32 *left,
+                                   const upb_prepared_f32 *middle, const upb_prepared_f32 *right, uint16_t *distance,
+                                   uint8_t *intensity);
+
+/* For tests: the networks' outputs before rounding, limits and the all-empty rule; [UPB_LANES] each, no alignment needed. */
+typedef void (*upb_raw_f32_fn)(const upb_model_f32 *model, const upb_prepared_f32 *left, const upb_prepared_f32 *middle,
+                               const upb_prepared_f32 *right, float *distance, float *intensity);
+
+typedef struct upb_kernels {
+    upb_prepare_f32_fn prepare_f32;
+    upb_windows_f32_fn windows_f32;
+    upb_raw_f32_fn raw_f32;
+} upb_kernels;
+
+/*
+ * Fills `kernels` with those of one instruction set, UPB_CPU_AUTO: the fastest. Returns the upb_cpu chosen, or UPB_CPU_AUTO
+ * if this machine or this build does not have the one asked for (`kernels` is then untouched).
+ */
+upb_cpu upb_kernels_select(upb_kernels *kernels, upb_cpu cpu);
+
+/* Each in its own file, compiled with the flags of its instruction set: call only where the machine has it. */
+void upb_kernels_fill_c(upb_kernels *kernels);
+void upb_kernels_fill_avx2(upb_kernels *kernels);
+void upb_kernels_fill_avx512(upb_kernels *kernels);
+void upb_kernels_fill_neon(upb_kernels *kernels);
+
+#endif /* UPB_KERNELS_H */

@@ -1,0 +1,1 @@
+"""The float side: network, geometry, readers, metrics, baselines, training."""

@@ -1,0 +1,211 @@
+"""What surrounds the two networks: the sensor they were made for, range limits, edges, empty pixels, the last row.
+
+Every implementation obeys the same rules; ``docs/model-format.md`` states them and this module is their NumPy form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .beams import BeamTable, between_rows
+from .network import WINDOW, FoldedNetwork
+
+__all__ = ["BEAMS", "ROWS", "Rules", "RulesError", "Windows", "extract_windows", "upsample_reference"]
+
+BEAMS = 32
+ROWS = 2 * BEAMS
+PAIRS = BEAMS - 1
+"""Windows of a column: pairs of neighbouring beams."""
+
+U16 = NDArray[np.uint16]
+U8 = NDArray[np.uint8]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+class RulesError(ValueError):
+    """An impossible rule: names it and says what was expected."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Sensor and rules of a model. Angles in degrees, distances in sensor counts of ``distance_unit_m``."""
+
+    sensor: str
+    columns: int
+    """Per turn."""
+    distance_unit_m: float
+    row_elevation_deg: FloatArray
+    """[64] of the output rows, top first."""
+    azimuth_offset_deg: FloatArray
+    """[32] of the input beams, clockwise from the firing's azimuth."""
+    row_height_m: FloatArray
+    """[64] height of each output row's laser origin over the sensor's; of a generated row, what makes its points fit."""
+    min_count: int
+    max_count: int
+    cut_deg: float = 180.0
+    edge: Literal["zero", "seam"] = "seam"
+    last_row: Literal["repeat", "empty"] = "empty"
+    empty: Literal["none", "fill"] = "fill"
+
+    def __post_init__(self) -> None:
+        for name, size in (("row_elevation_deg", ROWS), ("azimuth_offset_deg", BEAMS), ("row_height_m", ROWS)):
+            array = np.asarray(getattr(self, name), dtype=np.float64)
+            if array.shape != (size,) or not np.all(np.isfinite(array)):
+                raise RulesError(f"{name} must be {size} finite numbers, got shape {list(array.shape)}")
+            object.__setattr__(self, name, array)
+        if np.any(np.diff(self.row_elevation_deg) >= 0):
+            raise RulesError("row_elevation_deg must fall strictly, top row first")
+        if not 1 <= self.min_count <= self.max_count <= 65535:
+            raise RulesError(f"range limits {self.min_count}..{self.max_count} counts, expected 1 <= min <= max <= 65535")
+        if not 4 <= self.columns <= 65535:
+            raise RulesError(f"columns {self.columns}, expected 4 to 65535")
+        if not 0 <= self.cut_deg < 360:
+            raise RulesError(f"cut_deg {self.cut_deg}, expected 0 to 360")
+        for name, allowed in (("edge", ("zero", "seam")), ("last_row", ("repeat", "empty")), ("empty", ("none", "fill"))):
+            if getattr(self, name) not in allowed:
+                raise RulesError(f"{name} {getattr(self, name)!r}, expected {' or '.join(allowed)}")
+
+    @classmethod
+    def for_beams(
+        cls,
+        beams: BeamTable,
+        *,
+        columns: int | None = None,
+        min_m: float = 3.0,
+        max_m: float = 80.0,
+        edge: Literal["zero", "seam"] = "seam",
+        last_row: Literal["repeat", "empty"] = "empty",
+        empty: Literal["none", "fill"] = "fill",
+    ) -> Rules:
+        """Rules for a 32-beam table (generated rows half way between beams) or a 64-beam one (every other beam is input)."""
+        if beams.beams not in (BEAMS, ROWS):
+            raise RulesError(f"beam table {beams.name!r} has {beams.beams} beams, expected {BEAMS} or {ROWS}")
+        native = beams.beams == BEAMS
+        step = slice(None) if native else slice(0, None, 2)
+        return cls(
+            sensor=beams.name if native else f"{beams.name}/2",
+            columns=columns or beams.columns,
+            distance_unit_m=beams.distance_unit_m,
+            row_elevation_deg=between_rows(beams.elevation_deg) if native else beams.elevation_deg,
+            azimuth_offset_deg=beams.azimuth_offset_deg[step],
+            row_height_m=between_rows(beams.vertical_offset_m) if native else beams.vertical_offset_m,
+            min_count=int(np.floor(min_m / beams.distance_unit_m + 0.5)),
+            max_count=min(65535, int(np.floor(max_m / beams.distance_unit_m + 0.5))),
+            edge=edge,
+            last_row=last_row,
+            empty=empty,
+        )
+
+    @property
+    def min_m(self) -> float:
+        return self.min_count * self.distance_unit_m
+
+    @property
+    def max_m(self) -> float:
+        return self.max_count * self.distance_unit_m
+
+    def valid(self, counts: NDArray[np.uint16]) -> BoolArray:
+        """Pixels that the networks may see: a return within the range limits."""
+        return (counts >= self.min_count) & (counts <= self.max_count)
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Network inputs of an image, after limits and empty-pixel rule: counts and intensities, ``[31, W, 6]``."""
+
+    distance: FloatArray
+    intensity: FloatArray
+    any_return: BoolArray
+    """``[31, W]``: the window holds at least one valid pixel."""
+
+
+def extract_windows(distance: U16, intensity: U8, rules: Rules, *, wrap: bool = False) -> Windows:
+    """Windows of an image ``[rows, W]``; both its ends are edges, or it is a closed turn (``wrap``).
+
+    Any number of rows >= 2 is taken: ``rows - 1`` pairs.
+    """
+    valid = rules.valid(distance)
+    d = np.where(valid, distance, 0).astype(np.float64)
+    i = np.where(valid, intensity, 0).astype(np.float64)
+    any_return = _neighbours(valid, wrap)
+    present = (any_return[:-1] | any_return[1:]).any(axis=-1)
+    if rules.empty == "none":
+        return Windows(_pair(_neighbours(d, wrap)), _pair(_neighbours(i, wrap)), present)
+    return Windows(_fill(d, valid, wrap), _fill(i, valid, wrap), present)
+
+
+def _neighbours(image: NDArray[np.generic], wrap: bool) -> NDArray[np.generic]:
+    """[rows, W] -> [rows, W, 3]: left, middle, right."""
+    edges = (image[:, -1:], image[:, :1]) if wrap else (np.zeros_like(image[:, :1]),) * 2
+    padded = np.concatenate([edges[0], image, edges[1]], axis=1)
+    return np.stack([padded[:, :-2], padded[:, 1:-1], padded[:, 2:]], axis=-1)
+
+
+def _pair(x: NDArray[np.generic]) -> FloatArray:
+    """[rows, W, 3] -> [rows - 1, W, 6]."""
+    return np.concatenate([x[:-1], x[1:]], axis=-1).astype(np.float64)
+
+
+def _fill(x: FloatArray, valid: BoolArray, wrap: bool) -> FloatArray:
+    top = _neighbours(np.where(valid[:-1], x[:-1], x[1:]), wrap)
+    bottom = _neighbours(np.where(valid[1:], x[1:], x[:-1]), wrap)
+    seen = _neighbours(valid[:-1] | valid[1:], wrap)
+    return np.concatenate([_fill_columns(top, seen), _fill_columns(bottom, seen)], axis=-1)
+
+
+def _fill_columns(x: NDArray[np.generic], seen: NDArray[np.generic]) -> FloatArray:
+    left, middle, right = (x[..., k].astype(np.float64) for k in range(3))
+    has_left, has_middle, has_right = (seen[..., k].astype(bool) for k in range(3))
+    between = np.where(has_left & has_right, np.minimum(left, right), np.where(has_left, left, right))
+    return np.stack(
+        [
+            np.where(has_left, left, np.where(has_middle, middle, right)),
+            np.where(has_middle, middle, between),
+            np.where(has_right, right, np.where(has_middle, middle, left)),
+        ],
+        axis=-1,
+    )
+
+
+def upsample_reference(
+    distance: ArrayLike, intensity: ArrayLike, networks: tuple[FoldedNetwork, FoldedNetwork], rules: Rules, *, wrap: bool = False
+) -> tuple[U16, U8]:
+    """Counts and intensities ``[32, W]`` -> ``[64, W]``, in float64: what every other implementation is compared with.
+
+    The image is azimuth aligned; its ends are edges unless ``wrap``. Even rows are the input's, to the bit.
+    """
+    d = np.asarray(distance, dtype=np.uint16)
+    i = np.asarray(intensity, dtype=np.uint8)
+    if d.ndim != 2 or d.shape[0] < 2 or i.shape != d.shape:
+        raise RulesError(f"distance {list(d.shape)} and intensity {list(i.shape)} must be equal shapes [beams, columns]")
+    windows = extract_windows(d, i, rules, wrap=wrap)
+    unit = rules.distance_unit_m
+    generated = generated_counts(networks[0](windows.distance * unit) / unit, windows, rules)
+    gi = np.clip(np.floor(networks[1](windows.intensity) + 0.5), 0, 255)
+    return _interleave(d, generated, rules), _interleave(i, np.where(generated > 0, gi, 0).astype(np.uint8), rules)
+
+
+def generated_counts(y_counts: FloatArray, windows: Windows, rules: Rules) -> U16:
+    """Network outputs in counts -> generated counts: rounded half up, 0 outside the limits or without any return."""
+    rounded = np.floor(y_counts + 0.5)
+    keep = (rounded >= rules.min_count) & (rounded <= rules.max_count)
+    if rules.empty == "fill":
+        keep &= windows.any_return
+    return np.where(keep, rounded, 0).astype(np.uint16)
+
+
+def _interleave(rows: NDArray[np.generic], generated: NDArray[np.generic], rules: Rules) -> NDArray[np.generic]:
+    out = np.zeros((2 * rows.shape[0], rows.shape[1]), dtype=rows.dtype)
+    out[0::2] = rows
+    out[1:-1:2] = generated
+    if rules.last_row == "repeat":
+        out[-1] = rows[-1]
+    return out
+
+
+assert WINDOW == 6  # the order of _fill and _pair

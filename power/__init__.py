@@ -1,0 +1,1 @@
+"""What the work costs: operations, memory, reports."""

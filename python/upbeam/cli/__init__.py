@@ -1,0 +1,1 @@
+"""The command line: it may import everything, and hands backends and frame sources down as arguments."""

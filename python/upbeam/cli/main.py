@@ -1,0 +1,68 @@
+"""Entry point of ``upbeam``. Exit status: 0 done, 1 the checked condition failed, 2 bad input or usage."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import click
+import typer
+
+import upbeam
+
+from . import doctor, evaluate, inspect, ops, simulate, stream, train, upsample
+from .common import message
+
+__all__ = ["app", "run"]
+
+app = typer.Typer(
+    name="upbeam",
+    help="Turns a 32-beam LiDAR into a 64-beam one. Every command takes --json.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+app.command("stream")(stream.stream)
+app.command("upsample")(upsample.upsample)
+app.command("ops")(ops.ops)
+app.command("evaluate")(evaluate.evaluate)
+app.command("train")(train.train)
+app.command("simulate")(simulate.simulate)
+app.command("inspect")(inspect.inspect)
+app.command("doctor")(doctor.doctor)
+
+
+def _print_version(value: bool) -> None:
+    if value:
+        typer.echo(f"upbeam {upbeam.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")] = False,
+) -> None:
+    pass
+
+
+def run() -> None:
+    """The console script: every error a user can cause becomes one line and status 2."""
+    try:
+        status = app(standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        sys.exit(2)
+    except click.ClickException as error:
+        message(f"upbeam: {error.format_message()}")
+        sys.exit(2)
+    except (KeyboardInterrupt, click.Abort):
+        message("upbeam: interrupted")
+        sys.exit(130)
+    except OSError as error:
+        message(f"upbeam: {error.filename or ''}{': ' if error.filename else ''}{error.strerror or error}")
+        sys.exit(2)
+    except ValueError as error:
+        message(f"upbeam: {error}")
+        sys.exit(2)
+    sys.exit(status or 0)

@@ -1,0 +1,1 @@
+"""The C runtime and what drives it: models, streams, the live runner."""

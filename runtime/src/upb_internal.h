@@ -1,0 +1,26 @@
+/* What the source files of the library share. */
+#ifndef UPB_INTERNAL_H
+#define UPB_INTERNAL_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#include "upb_kernels.h"
+#include "upbeam/upbeam.h"
+
+struct upb_model {
+    upb_model_f32 f32;
+    upb_model_info info;
+};
+
+/* Fills `error` unless it is null, and returns `status`. `what` is cut to fit. */
+upb_status upb_fail(upb_error *error, upb_status status, const char *what, uint64_t offset, uint64_t got,
+                    uint64_t expected);
+
+/* OK if `bytes` bytes at `memory` can hold `needed`. */
+upb_status upb_check_memory(const void *memory, size_t bytes, size_t needed, upb_error *error);
+
+/* floor(offset * columns / 360 degrees + 0.5), exact. */
+int32_t upb_offset_columns(int32_t offset_udeg, uint32_t columns);
+
+#endif /* UPB_INTERNAL_H */

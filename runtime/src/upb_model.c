@@ -1,0 +1,399 @@
+/* Reads .ubm model files (docs/model-format.md). Bounded: every byte is looked at a fixed number of times. */
+#include <string.h>
+
+#include "upb_internal.h"
+
+enum {
+    HEADER_BYTES = 32,
+    ENTRY_BYTES = 16,
+    CRC_BYTES = 4,
+    FILE_BYTES_MAX = 1 << 20,
+    SECTIONS_MAX = 32,
+    SENS_BYTES = 704,
+    NETWORK_HEAD_BYTES = 16,
+    UNIT_NUMBERS = UPB_TAPS + 2 /* weights, b and v of a hidden unit */
+};
+
+#define TAG(a, b, c, d) ((uint32_t)(a) | (uint32_t)(b) << 8 | (uint32_t)(c) << 16 | (uint32_t)(d) << 24)
+#define SECTION_REQUIRED 1u
+#define NETWORK_POSITIVE 1u
+#define MAGNITUDE_MAX 1e6f
+
+typedef struct section {
+    uint32_t tag, flags, offset, bytes;
+} section;
+
+/* The file while it is read. */
+typedef struct reader {
+    const uint8_t *bytes;
+    size_t size;
+    upb_error *error;
+} reader;
+
+/* Bytes one by one: a file may lie at any address, and the machine may be big-endian. */
+static uint32_t u16_at(const reader *r, size_t at) { return (uint32_t)r->bytes[at] | (uint32_t)r->bytes[at + 1] << 8; }
+
+static uint32_t u32_at(const reader *r, size_t at) { return u16_at(r, at) | u16_at(r, at + 2) << 16; }
+
+static int32_t i32_at(const reader *r, size_t at) {
+    uint32_t bits = u32_at(r, at);
+    int32_t value;
+    memcpy(&value, &bits, sizeof value); /* two's complement on every machine that has an int32_t */
+    return value;
+}
+
+static upb_status bad_value(const reader *r, const char *what, size_t at, uint64_t got, uint64_t expected) {
+    return upb_fail(r->error, UPB_E_VALUE, what, at, got, expected);
+}
+
+/* An u32 within low..high. A value out of range is reported with the limit that it crosses. */
+static upb_status ranged(const reader *r, const char *what, size_t at, uint32_t low, uint32_t high, uint32_t *value) {
+    *value = u32_at(r, at);
+    if (*value < low || *value > high)
+        return bad_value(r, what, at, *value, *value < low ? low : high);
+    return UPB_OK;
+}
+
+/* Appends `[index]` to the zero terminated `text`, which has room. index <= 999 */
+static void append_index(char *text, unsigned index) {
+    char digits[3];
+    unsigned n = 0;
+    do {
+        digits[n++] = (char)('0' + index % 10);
+        index /= 10;
+    } while (index);
+    text += strlen(text);
+    *text++ = '[';
+    while (n)
+        *text++ = digits[--n];
+    *text++ = ']';
+    *text = 0;
+}
+
+/* bad_value() with `what` followed by [index]. */
+static upb_status bad_element(const reader *r, const char *what, unsigned index, size_t at, uint64_t got,
+                              uint64_t expected) {
+    char text[32] = "";
+    strncat(text, what, 20);
+    append_index(text, index);
+    return bad_value(r, text, at, got, expected);
+}
+
+/* ----------------------------------------------------------------------------------------------- frame */
+
+/* CRC-32 ISO-HDLC, half a byte at a time: a table of 64 bytes instead of 1024. */
+static uint32_t crc32_of(const uint8_t *bytes, size_t size) {
+    static const uint32_t table[16] = {0x00000000, 0x1db71064, 0x3b6e20c8, 0x26d930ac, 0x76dc4190, 0x6b6b51f4,
+                                       0x4db26158, 0x5005713c, 0xedb88320, 0xf00f9344, 0xd6d6a3e8, 0xcb61b38c,
+                                       0x9b64c2b0, 0x86d3d2d4, 0xa00ae278, 0xbdbdf21c};
+    uint32_t crc = 0xffffffffu;
+    for (size_t i = 0; i < size; i++) {
+        crc = crc >> 4 ^ table[(crc ^ bytes[i]) & 15];
+        crc = crc >> 4 ^ table[(crc ^ (uint32_t)(bytes[i] >> 4)) & 15];
+    }
+    return ~crc;
+}
+
+/* Checks the header and the checksum. `sections` receives the number of sections. */
+static upb_status read_header(const reader *r, uint32_t *sections, uint32_t *crc) {
+    uint32_t file_bytes;
+    size_t magic_bytes = r->size < 4 ? r->size : 4;
+    if (memcmp(r->bytes, "UPBM", magic_bytes) != 0)
+        return upb_fail(r->error, UPB_E_MAGIC, "magic", 0, magic_bytes == 4 ? u32_at(r, 0) : 0,
+                        TAG('U', 'P', 'B', 'M'));
+    if (r->size < HEADER_BYTES + CRC_BYTES)
+        return upb_fail(r->error, UPB_E_TRUNCATED, "file", 0, r->size, HEADER_BYTES + CRC_BYTES);
+    if (u16_at(r, 4) != 0)
+        return upb_fail(r->error, UPB_E_VERSION, "version", 4, u16_at(r, 4), 0);
+    if (u16_at(r, 6) != HEADER_BYTES)
+        return bad_value(r, "header_bytes", 6, u16_at(r, 6), HEADER_BYTES);
+    upb_status status = ranged(r, "file_bytes", 8, HEADER_BYTES + CRC_BYTES, FILE_BYTES_MAX, &file_bytes);
+    if (status != UPB_OK)
+        return status;
+    if (file_bytes != r->size)
+        return upb_fail(r->error, UPB_E_TRUNCATED, "file_bytes", 8, r->size, file_bytes);
+    *crc = u32_at(r, r->size - CRC_BYTES);
+    uint32_t computed = crc32_of(r->bytes, r->size - CRC_BYTES);
+    if (*crc != computed)
+        return upb_fail(r->error, UPB_E_CRC, "crc32", r->size - CRC_BYTES, *crc, computed);
+    for (size_t at = 16; at < HEADER_BYTES; at++)
+        if (r->bytes[at])
+            return bad_value(r, "reserved", at, r->bytes[at], 0);
+    return ranged(r, "sections", 12, 1, SECTIONS_MAX, sections);
+}
+
+static upb_status bad_section(const reader *r, uint32_t tag, size_t at, uint64_t got, uint64_t expected) {
+    const char text[5] = {(char)(tag & 255), (char)(tag >> 8 & 255), (char)(tag >> 16 & 255), (char)(tag >> 24), 0};
+    return upb_fail(r->error, UPB_E_SECTION, text, at, got, expected);
+}
+
+/* Checks one entry of the section table at `at`; `end` is where the section before it (or the table) ends. */
+static upb_status read_entry(const reader *r, size_t at, size_t end, section *entry) {
+    const size_t limit = r->size - CRC_BYTES;
+    entry->tag = u32_at(r, at);
+    entry->flags = u32_at(r, at + 4);
+    entry->offset = u32_at(r, at + 8);
+    entry->bytes = u32_at(r, at + 12);
+    for (size_t i = 0; i < 4; i++)
+        if (r->bytes[at + i] < 0x20 || r->bytes[at + i] > 0x7e)
+            return bad_value(r, "tag", at + i, r->bytes[at + i], 0x20);
+    if (entry->flags & ~SECTION_REQUIRED)
+        return bad_value(r, "flags", at + 4, entry->flags, SECTION_REQUIRED);
+    if (entry->offset % 8)
+        return bad_section(r, entry->tag, at + 8, entry->offset, entry->offset / 8 * 8);
+    if (entry->offset < end)
+        return bad_section(r, entry->tag, at + 8, entry->offset, end);
+    if (entry->offset > limit || entry->bytes > limit - entry->offset)
+        return bad_section(r, entry->tag, at + 12, (uint64_t)entry->offset + entry->bytes, limit);
+    for (size_t i = end; i < entry->offset; i++)
+        if (r->bytes[i])
+            return bad_value(r, "gap", i, r->bytes[i], 0);
+    return UPB_OK;
+}
+
+/* Reads the section table into `entries` (SECTIONS_MAX). */
+static upb_status read_table(const reader *r, uint32_t sections, section *entries) {
+    size_t end = HEADER_BYTES + (size_t)sections * ENTRY_BYTES;
+    if (end > r->size - CRC_BYTES)
+        return upb_fail(r->error, UPB_E_SECTION, "section table", 12, end, r->size - CRC_BYTES);
+    for (uint32_t i = 0; i < sections; i++) {
+        const size_t at = HEADER_BYTES + (size_t)i * ENTRY_BYTES;
+        upb_status status = read_entry(r, at, end, &entries[i]);
+        if (status != UPB_OK)
+            return status;
+        for (uint32_t j = 0; j < i; j++)
+            if (entries[j].tag == entries[i].tag) /* twice: expected is where the first stands */
+                return bad_section(r, entries[i].tag, at, at, HEADER_BYTES + (uint64_t)j * ENTRY_BYTES);
+        end = (size_t)entries[i].offset + entries[i].bytes;
+    }
+    for (; end < r->size - CRC_BYTES; end++)
+        if (r->bytes[end])
+            return bad_value(r, "gap", end, r->bytes[end], 0);
+    return UPB_OK;
+}
+
+/* ------------------------------------------------------------------------------------------------ SENS */
+
+static upb_status read_name(const reader *r, size_t at, char name[32]) {
+    int ended = 0;
+    for (unsigned i = 0; i < 32; i++) {
+        uint8_t c = r->bytes[at + i];
+        int bad = ended ? c != 0 : c != 0 && (c < 0x20 || c > 0x7e);
+        if (bad || (i == 31 && c))
+            return bad_element(r, "SENS.name", i, at + i, c, 0);
+        ended = c == 0;
+        name[i] = (char)c;
+    }
+    return UPB_OK;
+}
+
+static upb_status read_rules(const reader *r, size_t at, upb_model_info *info) {
+    const uint8_t *rule = r->bytes + at;
+    if (rule[0] > UPB_EDGE_SEAM)
+        return bad_value(r, "SENS.edge", at, rule[0], UPB_EDGE_SEAM);
+    if (rule[1] > UPB_LAST_ROW_EMPTY)
+        return bad_value(r, "SENS.last_row", at + 1, rule[1], UPB_LAST_ROW_EMPTY);
+    if (rule[2] > UPB_EMPTY_FILL)
+        return bad_value(r, "SENS.empty_rule", at + 2, rule[2], UPB_EMPTY_FILL);
+    for (unsigned i = 3; i < 8; i++)
+        if (rule[i])
+            return bad_element(r, "SENS.reserved", i - 3, at + i, rule[i], 0);
+    info->edge = rule[0];
+    info->last_row = rule[1];
+    info->empty_rule = rule[2];
+    return UPB_OK;
+}
+
+static upb_status read_geometry(const reader *r, size_t at, upb_model_info *info) {
+    const int32_t top = 90000000, side = 45000000, high = 10000000;
+    int64_t above = (int64_t)top + 1;
+    for (unsigned row = 0; row < UPB_ROWS; row++, at += 4) {
+        int32_t elevation = i32_at(r, at);
+        if (elevation < -top || elevation >= above)
+            return bad_element(r, "SENS.elevation", row, at, (uint64_t)(int64_t)elevation,
+                               (uint64_t)(elevation < -top ? -(int64_t)top : above - 1));
+        info->row_elevation_udeg[row] = elevation;
+        above = elevation;
+    }
+    for (unsigned beam = 0; beam < UPB_BEAMS; beam++, at += 4) {
+        int32_t offset = i32_at(r, at);
+        if (offset < -side || offset > side)
+            return bad_element(r, "SENS.azimuth_offset", beam, at, (uint64_t)(int64_t)offset,
+                               (uint64_t)(int64_t)(offset < 0 ? -side : side));
+        info->azimuth_offset_udeg[beam] = offset;
+    }
+    for (unsigned row = 0; row < UPB_ROWS; row++, at += 4) {
+        int32_t height = i32_at(r, at);
+        if (height < -high || height > high)
+            return bad_element(r, "SENS.row_height", row, at, (uint64_t)(int64_t)height,
+                               (uint64_t)(int64_t)(height < 0 ? -high : high));
+        info->row_height_um[row] = height;
+    }
+    return UPB_OK;
+}
+
+static upb_status read_sensor(const reader *r, const section *s, upb_model_info *info) {
+    const size_t at = s->offset;
+    uint32_t beams;
+    upb_status status;
+    if (s->bytes != SENS_BYTES)
+        return bad_value(r, "SENS.bytes", at, s->bytes, SENS_BYTES);
+    if ((status = read_name(r, at, info->sensor)) != UPB_OK ||
+        (status = ranged(r, "SENS.beams", at + 32, UPB_BEAMS, UPB_BEAMS, &beams)) != UPB_OK ||
+        (status = ranged(r, "SENS.columns", at + 36, 4, UPB_MAX_COLUMNS, &info->columns)) != UPB_OK ||
+        (status = ranged(r, "SENS.distance_unit_um", at + 40, 100, 100000, &info->distance_unit_um)) != UPB_OK ||
+        (status = ranged(r, "SENS.cut_mdeg", at + 44, 0, 359999, &info->cut_mdeg)) != UPB_OK ||
+        (status = ranged(r, "SENS.max_count", at + 52, 1, 65535, &info->max_count)) != UPB_OK ||
+        (status = ranged(r, "SENS.min_count", at + 48, 1, info->max_count, &info->min_count)) != UPB_OK ||
+        (status = read_rules(r, at + 56, info)) != UPB_OK)
+        return status;
+    return read_geometry(r, at + 64, info);
+}
+
+/* ------------------------------------------------------------------------------------------------ NETW */
+
+/* A finite float of magnitude at most 1e6. `network` and the field's name make the report. */
+static upb_status read_float(const reader *r, unsigned network, const char *field, size_t at, float *value) {
+    uint32_t bits = u32_at(r, at);
+    memcpy(value, &bits, sizeof *value);
+    if (*value >= -MAGNITUDE_MAX && *value <= MAGNITUDE_MAX) /* false for NaN too */
+        return UPB_OK;
+    char text[32] = "NETW";
+    append_index(text, network);
+    strncat(text, field, 12);
+    return bad_value(r, text, at, bits, (uint64_t)MAGNITUDE_MAX);
+}
+
+static upb_status read_head(const reader *r, unsigned network, size_t at, upb_network_f32 *net) {
+    static const char hidden_name[2][16] = {"NETW[0].hidden", "NETW[1].hidden"};
+    static const char flags_name[2][16] = {"NETW[0].flags", "NETW[1].flags"};
+    static const char slope_name[2][16] = {"NETW[0].slope", "NETW[1].slope"};
+    upb_status status;
+    if ((status = ranged(r, hidden_name[network], at, 1, UPB_MAX_HIDDEN, &net->hidden)) != UPB_OK ||
+        (status = ranged(r, flags_name[network], at + 4, 0, NETWORK_POSITIVE, &net->positive)) != UPB_OK ||
+        (status = read_float(r, network, ".slope", at + 8, &net->slope)) != UPB_OK)
+        return status;
+    if (!(net->slope >= 0.0f && net->slope <= 1.0f))
+        return bad_value(r, slope_name[network], at + 8, u32_at(r, at + 8), 1);
+    return read_float(r, network, ".skip", at + 12, &net->skip);
+}
+
+/* Reads the network at `*at`, which ends before `end`, and moves `*at` behind it. */
+static upb_status read_network(const reader *r, unsigned network, size_t *at, size_t end, upb_network_f32 *net) {
+    if (end - *at < NETWORK_HEAD_BYTES)
+        return bad_value(r, "NETW.bytes", *at, end - *at, NETWORK_HEAD_BYTES);
+    upb_status status = read_head(r, network, *at, net);
+    if (status != UPB_OK)
+        return status;
+    const size_t hidden = net->hidden, a = *at + NETWORK_HEAD_BYTES;
+    const size_t b = a + hidden * UPB_TAPS * 4, v = b + hidden * 4, c = v + hidden * 4;
+    if (end - a < hidden * UNIT_NUMBERS * 4 + 4)
+        return bad_value(r, "NETW.bytes", a, end - a, hidden * UNIT_NUMBERS * 4 + 4);
+    for (size_t h = 0; h < hidden; h++) {
+        for (size_t i = 0; i < UPB_TAPS; i++)
+            if ((status = read_float(r, network, ".A", a + (h * UPB_TAPS + i) * 4, &net->unit[h][i])) != UPB_OK)
+                return status;
+        if ((status = read_float(r, network, ".b", b + h * 4, &net->unit[h][UPB_UNIT_BIAS])) != UPB_OK ||
+            (status = read_float(r, network, ".v", v + h * 4, &net->unit[h][UPB_UNIT_OUTPUT])) != UPB_OK)
+            return status;
+    }
+    *at = c + 4;
+    return read_float(r, network, ".c", c, &net->offset);
+}
+
+/* From metres in and out to counts: the kernels then need no multiplication by the unit. */
+static void fold_unit(upb_network_f32 *net, uint32_t unit_um) {
+    const double unit_m = unit_um * 1e-6;
+    for (uint32_t h = 0; h < net->hidden; h++) {
+        for (int i = 0; i < UPB_TAPS; i++)
+            net->unit[h][i] = (float)(net->unit[h][i] * unit_m);
+        net->unit[h][UPB_UNIT_OUTPUT] = (float)(net->unit[h][UPB_UNIT_OUTPUT] / unit_m);
+    }
+    net->offset = (float)(net->offset / unit_m);
+}
+
+static upb_status read_networks(const reader *r, const section *s, upb_model *model) {
+    size_t at = s->offset;
+    const size_t end = at + s->bytes;
+    uint32_t count;
+    if (s->bytes < 4)
+        return bad_value(r, "NETW.bytes", at, s->bytes, 4);
+    upb_status status = ranged(r, "NETW.count", at, 2, 2, &count);
+    at += 4;
+    for (unsigned n = 0; n < 2 && status == UPB_OK; n++)
+        status = read_network(r, n, &at, end, &model->f32.network[n]);
+    if (status != UPB_OK)
+        return status;
+    if (at != end)
+        return bad_value(r, "NETW.bytes", s->offset, s->bytes, at - s->offset);
+    fold_unit(&model->f32.network[UPB_DISTANCE], model->info.distance_unit_um);
+    return UPB_OK;
+}
+
+/* ------------------------------------------------------------------------------------------------ file */
+
+/* Finds what this reader needs; refuses required sections that it does not read. */
+static upb_status find_sections(const reader *r, uint32_t sections, const section *entries, const section **sens,
+                                const section **netw) {
+    *sens = *netw = NULL;
+    for (uint32_t i = 0; i < sections; i++) {
+        if (entries[i].tag == TAG('S', 'E', 'N', 'S'))
+            *sens = &entries[i];
+        else if (entries[i].tag == TAG('N', 'E', 'T', 'W'))
+            *netw = &entries[i];
+        else if (entries[i].flags & SECTION_REQUIRED)
+            return bad_section(r, entries[i].tag, HEADER_BYTES + (size_t)i * ENTRY_BYTES, entries[i].flags, 0);
+    }
+    if (!*sens || !*netw)
+        return bad_section(r, *sens ? TAG('N', 'E', 'T', 'W') : TAG('S', 'E', 'N', 'S'), 0, 0, 1);
+    return UPB_OK;
+}
+
+static upb_status read_file(const reader *r, upb_model *model) {
+    section entries[SECTIONS_MAX];
+    const section *sens, *netw;
+    uint32_t sections = 0;
+    upb_status status;
+    if ((status = read_header(r, &sections, &model->info.crc32)) != UPB_OK ||
+        (status = read_table(r, sections, entries)) != UPB_OK ||
+        (status = find_sections(r, sections, entries, &sens, &netw)) != UPB_OK ||
+        (status = read_sensor(r, sens, &model->info)) != UPB_OK ||
+        (status = read_networks(r, netw, model)) != UPB_OK)
+        return status;
+    for (int n = 0; n < 2; n++)
+        model->info.hidden[n] = model->f32.network[n].hidden;
+    model->f32.min_count = (float)model->info.min_count;
+    model->f32.max_count = (float)model->info.max_count;
+    model->f32.fill = model->info.empty_rule == UPB_EMPTY_FILL;
+    return UPB_OK;
+}
+
+size_t upb_model_bytes(void) {
+    _Static_assert(sizeof(upb_model) <= UPB_MODEL_BYTES_MAX, "raise UPB_MODEL_BYTES_MAX");
+    return sizeof(upb_model);
+}
+
+upb_status upb_model_load(void *memory, size_t memory_bytes, const void *ubm, size_t ubm_bytes, upb_model **model,
+                          upb_error *error) {
+    if (model)
+        *model = NULL;
+    if (!model || !ubm)
+        return upb_fail(error, UPB_E_ARGUMENT, model ? "ubm" : "model", 0, 0, 0);
+    upb_status status = upb_check_memory(memory, memory_bytes, sizeof(upb_model), error);
+    if (status != UPB_OK)
+        return status;
+    const reader r = {ubm, ubm_bytes, error};
+    upb_model *loaded = memory;
+    memset(loaded, 0, sizeof *loaded);
+    status = read_file(&r, loaded);
+    if (status == UPB_OK)
+        *model = loaded;
+    return status;
+}
+
+upb_status upb_model_get_info(const upb_model *model, upb_model_info *info) {
+    if (!model || !info)
+        return UPB_E_ARGUMENT;
+    *info = model->info;
+    return UPB_OK;
+}

@@ -1,0 +1,199 @@
+"""The C runtime from Python: models, whole images, column streams."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from upbeam.model.geometry import to_counts
+from upbeam.model.rules import BEAMS, ROWS, Rules
+from upbeam.quant.ubm import ModelFile, UbmError, read_ubm
+
+from ._native import Model as NativeModel
+from ._native import Stream as NativeStream
+
+__all__ = ["BACKENDS", "PRECISIONS", "ColumnStream", "Columns", "Model", "Upsampler", "generated_rows", "load_model"]
+
+U16 = NDArray[np.uint16]
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+
+PRECISIONS = ("fp32",)
+"""Of this version; ``int16`` and ``int8`` need the integer contract."""
+BACKENDS = ("cpu",)
+"""Of this version."""
+
+
+class Model:
+    """A model file, parsed twice: by Python (for people and tools) and by the C runtime (which computes with it)."""
+
+    def __init__(self, data: bytes) -> None:
+        """Raises UbmError for bytes that are not a sound model."""
+        self.data = data
+        self.file: ModelFile = read_ubm(data)
+        self.native = NativeModel(data)
+        self.info: dict[str, Any] = self.native.info()
+
+    @property
+    def rules(self) -> Rules:
+        return self.file.rules
+
+    @property
+    def distance_unit_m(self) -> float:
+        """Size of one distance count in metres."""
+        return self.rules.distance_unit_m
+
+    @property
+    def columns(self) -> int:
+        """Columns per turn."""
+        return self.rules.columns
+
+    @property
+    def crc32(self) -> int:
+        """The file's checksum: the model's identity in reports."""
+        return int(self.info["crc32"])
+
+    def __repr__(self) -> str:
+        return f"Model({self.rules.sensor!r}, {self.columns} columns, crc32 {self.crc32:08x})"
+
+
+def load_model(path: str | Path | None = None) -> Model:
+    """A ``.ubm`` model; without a path, the one shipped with the package. Raises UbmError naming the file."""
+    if path is None:
+        shipped = resources.files("upbeam.quant").joinpath("models").joinpath("default.ubm")
+        return Model(shipped.read_bytes())
+    read_ubm(path)  # its errors name the file
+    try:
+        return Model(Path(path).read_bytes())
+    except ValueError as error:
+        raise UbmError(f"{path}: {error}") from None
+
+
+def generated_rows() -> NDArray[np.bool_]:
+    """``[64]``: True for the output rows that no laser measured."""
+    return np.arange(ROWS) % 2 == 1
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Finished columns of a stream, in order."""
+
+    distance: U16
+    """[n, 64] counts"""
+    intensity: U8
+    """[n, 64]"""
+    frame: NDArray[np.uint64]
+    """[n] turns since the stream's start"""
+    column: NDArray[np.uint64]
+    """[n] place in the turn"""
+    incomplete: NDArray[np.bool_]
+    """[n] at least one beam's column never arrived"""
+
+    def __len__(self) -> int:
+        return len(self.column)
+
+
+class Upsampler:
+    """Turns 32 rows into 64. Holds no image state: every call is an image of its own, whose two ends are edges.
+
+    Use ``stream()`` for a sensor that keeps turning.
+    """
+
+    def __init__(
+        self, model: Model, precision: str = "fp32", backend: str = "cpu", *, columns: int | None = None, cpu: str = "auto"
+    ) -> None:
+        """``columns``: width of the images where it is not the model's. ``cpu``: force ``scalar``, ``avx2``, ``avx512``, ``neon``."""
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision {precision!r} is not available, expected one of: {', '.join(PRECISIONS)}")
+        if backend not in BACKENDS:
+            raise ValueError(f"backend {backend!r} is not available, expected one of: {', '.join(BACKENDS)}")
+        self.model = model
+        self.precision = precision
+        self.backend = backend
+        self.columns = columns or model.columns
+        self._cpu = cpu
+        self._stream = NativeStream(
+            model.native, cpu=cpu, columns=self.columns, any_sensor=columns is not None, aligned=True
+        )
+
+    @property
+    def cpu(self) -> str:
+        """The instruction set in use."""
+        return str(self._stream.stats()["cpu"])
+
+    @overload
+    def __call__(self, distance: U16, intensity: U8) -> tuple[U16, U8]: ...
+    @overload
+    def __call__(self, distance: F32, intensity: U8) -> tuple[F32, U8]: ...
+    def __call__(self, distance: Any, intensity: Any) -> tuple[Any, U8]:
+        """``[32, W]`` azimuth-aligned distances and intensities (uint8) -> both as ``[64, W]``.
+
+        Distances are uint16 counts (``model.distance_unit_m`` each) or float32 metres; the result has the same type. Even rows are
+        the input's, to the bit. Raises ValueError for other types and shapes, and for metres that are NaN, infinite or negative.
+        """
+        d, i = np.asarray(distance), np.asarray(intensity)
+        self._check(d, i)
+        if d.dtype == np.uint16:
+            return self._stream.image(np.ascontiguousarray(d), np.ascontiguousarray(i))
+        counts, _ = to_counts(d, self.model.distance_unit_m)
+        out, grey = self._stream.image(counts, np.ascontiguousarray(i))
+        metres = out.astype(np.float32) * np.float32(self.model.distance_unit_m)
+        metres[0::2] = d
+        if self.model.rules.last_row == "repeat":
+            metres[-1] = d[-1]
+        return metres, grey
+
+    def stream(self, *, aligned: bool = False) -> ColumnStream:
+        """A column stream. ``aligned``: the columns are destaggered already."""
+        return ColumnStream(self.model, columns=self.columns, cpu=self._cpu, aligned=aligned)
+
+    def _check(self, distance: NDArray[Any], intensity: NDArray[Any]) -> None:
+        shape = (BEAMS, self.columns)
+        if distance.dtype not in (np.uint16, np.float32):
+            raise ValueError(f"distance is {distance.dtype}, expected uint16 counts or float32 metres")
+        if intensity.dtype != np.uint8:
+            raise ValueError(f"intensity is {intensity.dtype}, expected uint8")
+        for name, array in (("distance", distance), ("intensity", intensity)):
+            if array.shape != shape:
+                raise ValueError(f"{name} has shape {list(array.shape)}, expected {list(shape)} (beams, columns)")
+
+
+class ColumnStream:
+    """A sensor that keeps turning: columns in, finished columns out, a few columns behind."""
+
+    def __init__(self, model: Model, *, columns: int | None = None, cpu: str = "auto", aligned: bool = False) -> None:
+        self.model = model
+        self._stream = NativeStream(
+            model.native, cpu=cpu, columns=columns or 0, any_sensor=columns is not None, aligned=aligned
+        )
+
+    def push(self, distance: U16, intensity: U8, column: int) -> Columns:
+        """Firing columns ``[n, 32]`` (uint16 counts, uint8), the first at place ``column`` of the turn. Late ones are dropped and
+        counted in ``stats``; places that were skipped come out as columns without a return."""
+        if distance.dtype != np.uint16 or intensity.dtype != np.uint8:
+            raise ValueError(f"columns are {distance.dtype} and {intensity.dtype}, expected uint16 and uint8")
+        return _columns(*self._stream.push(np.ascontiguousarray(distance), np.ascontiguousarray(intensity), column))
+
+    def gap(self, columns: int) -> Columns:
+        """Inserts columns that never arrived."""
+        return _columns(*self._stream.gap(columns))
+
+    def flush(self) -> Columns:
+        """Ends the stream with an edge: what was pending."""
+        return _columns(*self._stream.flush())
+
+    def stats(self) -> dict[str, Any]:
+        """Counts, delay and memory: see ``upb_stream_stats``."""
+        return self._stream.stats()
+
+
+_INCOMPLETE = 1
+
+
+def _columns(distance: U16, intensity: U8, place: NDArray[np.uint64]) -> Columns:
+    return Columns(distance, intensity, place[:, 0], place[:, 1], (place[:, 2] & np.uint64(_INCOMPLETE)) != 0)

@@ -1,0 +1,58 @@
+"""One seed a session, shown in the header; the real LiDAR data, if this machine has it."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from pathlib import Path
+
+import hypothesis
+import numpy as np
+import pytest
+
+DEFAULT_SEED = 20
+ROOT = Path(__file__).resolve().parent.parent
+
+# Wall-clock time is never asserted; no example database, so that a seed alone tells what ran.
+hypothesis.settings.register_profile("upbeam", deadline=None, database=None, print_blob=True)
+hypothesis.settings.load_profile("upbeam")
+
+
+def _seed() -> int:
+    text = os.environ.get("UPBEAM_SEED", str(DEFAULT_SEED))
+    try:
+        return int(text)
+    except ValueError:
+        raise pytest.UsageError(f"UPBEAM_SEED is {text!r}: expected a whole number") from None
+
+
+def _data_dir() -> Path:
+    return Path(os.environ.get("UPBEAM_DATA") or ROOT.parent / "shared" / "data")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Hand the session's seed to hypothesis, unless its own option names one."""
+    if config.getoption("--hypothesis-seed", None) is None:
+        config.option.hypothesis_seed = str(_seed())
+
+
+def pytest_report_header(config: pytest.Config) -> list[str]:
+    seed = f"seed: {_seed()} (UPBEAM_SEED), hypothesis seed: {config.option.hypothesis_seed}"
+    data = _data_dir()
+    return [seed, f"real data: {data if data.is_dir() else f'none ({data} is not a folder; UPBEAM_DATA)'}"]
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """Random numbers of this test's own, from the session's seed: the same alone and in any order."""
+    return np.random.default_rng([_seed() % 2**32, zlib.crc32(request.node.nodeid.encode())])
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of real LiDAR data (``kitti/``, ``packets/``, ``sensor_calibration/``)."""
+    data = _data_dir()
+    if not data.is_dir():
+        pytest.skip(f"no real LiDAR data: {data} is not a folder (set UPBEAM_DATA)")
+    return data

@@ -1,0 +1,324 @@
+/*
+ * Every window kernel of this machine against the plain C one, on random and extreme columns; with --bench the very same
+ * calls are timed. Options: --seed N, --rounds N (models to check), --bench.
+ *
+ * What may differ: fused products round once where plain C rounds twice. So raw outputs agree within 1e-5 of the sum of
+ * the magnitudes that they are made of, and a count may flip where the output lies that near a threshold.
+ */
+#define _POSIX_C_SOURCE 199309L
+#include <math.h>
+#include <time.h>
+
+#include "check.h"
+#include "upb_kernels.h"
+
+#define TOLERANCE 1e-5
+
+typedef struct raw_column {
+    uint16_t distance[UPB_BEAMS];
+    uint8_t intensity[UPB_BEAMS];
+} raw_column;
+
+typedef struct result {
+    float raw[2][UPB_LANES];
+    uint16_t distance[UPB_LANES];
+    uint8_t intensity[UPB_LANES];
+} result;
+
+/* What is compared, for a failure's message. */
+typedef struct parameters {
+    const char *cpu_name, *pattern;
+    unsigned long seed;
+    unsigned round;
+    const upb_model_f32 *model;
+} parameters;
+
+static const char *const cpu_names[] = {"auto", "c", "avx2", "avx512", "neon"};
+
+static unsigned long long windows_compared, flips;
+
+/* ------------------------------------------------------------------------------------------------ inputs */
+
+static void random_network(random_source *random, upb_network_f32 *net, uint32_t hidden, float in_unit, float out_unit) {
+    memset(net, 0, sizeof *net);
+    net->hidden = hidden;
+    net->positive = random_below(random, 2);
+    net->slope = random_below(random, 4) ? 0.01f : (float)random_below(random, 2);
+    net->skip = random_below(random, 3) ? 1.0f : random_signed(random);
+    net->offset = out_unit * random_signed(random);
+    for (uint32_t h = 0; h < hidden; h++) {
+        for (int i = 0; i < UPB_TAPS; i++)
+            net->unit[h][i] = in_unit * random_signed(random);
+        net->unit[h][UPB_UNIT_BIAS] = random_signed(random);
+        net->unit[h][UPB_UNIT_OUTPUT] = out_unit * random_signed(random) / (float)hidden;
+    }
+}
+
+/* One model in four is wild: its outputs are far outside what counts can hold. */
+static void random_model_f32(random_source *random, upb_model_f32 *model, uint32_t hidden) {
+    const float wild = random_below(random, 4) ? 1.0f : 1e9f;
+    random_network(random, &model->network[UPB_DISTANCE], hidden, 0.002f, 500.0f * wild);
+    random_network(random, &model->network[UPB_INTENSITY], 1 + random_below(random, UPB_MAX_HIDDEN), 0.05f, 20.0f * wild);
+    const uint32_t low = 1 + random_below(random, 3000), high = low + random_below(random, 65536 - low);
+    model->min_count = (float)low;
+    model->max_count = (float)high;
+    model->fill = random_below(random, 2);
+}
+
+static const char *const patterns[] = {"random", "sparse", "zero", "max", "alternating", "single", "equal", "limits"};
+enum { PATTERNS = sizeof patterns / sizeof patterns[0] };
+
+static uint16_t pattern_distance(random_source *random, unsigned pattern, const upb_model_f32 *model, unsigned k,
+                                 unsigned chosen) {
+    const uint32_t low = (uint32_t)model->min_count, high = (uint32_t)model->max_count;
+    const uint16_t within = (uint16_t)(low + random_below(random, high - low + 1));
+    switch (pattern) {
+    case 0:
+        return within;
+    case 1:
+        return random_below(random, 3) ? 0 : within;
+    case 2:
+        return 0;
+    case 3:
+        return 65535;
+    case 4:
+        return k % 2 ? (uint16_t)high : 0;
+    case 5:
+        return k == chosen % UPB_BEAMS ? within : 0;
+    case 6:
+        return (uint16_t)(low + chosen % (high - low + 1));
+    default: { /* just inside and just outside */
+        const uint32_t near_limit[4] = {low - 1, low, high, high + 1};
+        return (uint16_t)near_limit[random_below(random, 4)];
+    }
+    }
+}
+
+static void pattern_column(random_source *random, unsigned pattern, const upb_model_f32 *model, raw_column *column) {
+    const unsigned chosen = random_u32(random);
+    for (unsigned k = 0; k < UPB_BEAMS; k++) {
+        column->distance[k] = pattern_distance(random, pattern, model, k, chosen);
+        column->intensity[k] = (uint8_t)(pattern == 3 ? 255 : pattern == 6 ? chosen >> 8 : random_below(random, 256));
+    }
+}
+
+/* -------------------------------------------------------------------------------------------- comparison */
+
+static void run(const upb_kernels *kernels, const upb_model_f32 *model, const raw_column column[3], result *out) {
+    upb_prepared_f32 prepared[3];
+    for (int c = 0; c < 3; c++)
+        kernels->prepare_f32(&prepared[c], model, column[c].distance, column[c].intensity);
+    kernels->windows_f32(model, &prepared[0], &prepared[1], &prepared[2], out->distance, out->intensity);
+    kernels->raw_f32(model, &prepared[0], &prepared[1], &prepared[2], out->raw[0], out->raw[1]);
+}
+
+/* The sum of the magnitudes that an output is made of: at most this much times 65535 for each tap. */
+static double magnitude(const upb_network_f32 *net, const float x[UPB_TAPS]) {
+    double sum = fabs((double)net->offset) + fabs((double)net->skip * x[6]);
+    for (uint32_t h = 0; h < net->hidden; h++) {
+        double inner = fabs((double)net->unit[h][UPB_UNIT_BIAS]);
+        for (int i = 0; i < UPB_TAPS; i++)
+            inner += fabs((double)net->unit[h][i] * x[i]);
+        sum += fabs((double)net->unit[h][UPB_UNIT_OUTPUT]) * inner;
+    }
+    return sum;
+}
+
+/* An upper bound of each tap's magnitude in window k: the largest value near it, wherever the fill took it from. */
+static void bound_taps(const raw_column column[3], int which, unsigned k, float x[UPB_TAPS]) {
+    float most = 0;
+    for (int c = 0; c < 3; c++)
+        for (unsigned beam = k; beam < k + 2; beam++) {
+            float value = which == UPB_DISTANCE ? column[c].distance[beam] : column[c].intensity[beam];
+            most = value > most ? value : most;
+        }
+    for (int i = 0; i < UPB_TAPS; i++)
+        x[i] = most;
+}
+
+static void complain(const parameters *p, const char *what, unsigned k, double got, double expected) {
+    if (check_failures > 20)
+        return;
+    fprintf(stderr, "    %s, lane %u: got %.9g, expected %.9g\n", what, k, got, expected);
+    fprintf(stderr, "    kernel %s, --seed %lu, round %u, columns %s, hidden %u and %u, limits %g..%g, fill %u\n",
+            p->cpu_name, p->seed, p->round, p->pattern, p->model->network[0].hidden, p->model->network[1].hidden,
+            (double)p->model->min_count, (double)p->model->max_count, p->model->fill);
+}
+
+/* Is an integer + 1/2, where floor(y + 0.5) jumps, within the tolerance of y? */
+static int at_threshold(double y, double tolerance) {
+    const double from_half = fabs(y - 0.5 - floor(y - 0.5 + 0.5));
+    /* y + 0.5 is itself rounded to a float */
+    return from_half <= tolerance + fabs(y) * 1.2e-7 + 6e-8;
+}
+
+static void compare_lane(const parameters *p, const raw_column column[3], const result *got, const result *expected,
+                         unsigned k) {
+    double tolerance[2];
+    for (int n = 0; n < 2; n++) {
+        float x[UPB_TAPS];
+        bound_taps(column, n, k, x);
+        tolerance[n] = TOLERANCE * magnitude(&p->model->network[n], x);
+        if (!CHECK(fabs((double)got->raw[n][k] - (double)expected->raw[n][k]) <= tolerance[n]))
+            complain(p, n ? "raw intensity" : "raw distance", k, (double)got->raw[n][k], (double)expected->raw[n][k]);
+    }
+    windows_compared++;
+    if (got->distance[k] == expected->distance[k] && got->intensity[k] == expected->intensity[k])
+        return;
+    flips++;
+    const int distance_ok =
+        got->distance[k] == expected->distance[k] || at_threshold((double)expected->raw[0][k], tolerance[0]);
+    /* An intensity follows its distance into and out of "no return". */
+    const int validity_flip = (got->distance[k] == 0) != (expected->distance[k] == 0);
+    const int intensity_ok = got->intensity[k] == expected->intensity[k] || validity_flip ||
+                             at_threshold((double)expected->raw[1][k], tolerance[1]);
+    if (!CHECK(distance_ok))
+        complain(p, "distance", k, got->distance[k], expected->distance[k]);
+    if (!CHECK(intensity_ok))
+        complain(p, "intensity", k, got->intensity[k], expected->intensity[k]);
+}
+
+static void compare_kernels(const parameters *p, const upb_kernels *kernels, const upb_kernels *reference,
+                            const raw_column column[3]) {
+    result got, expected;
+    run(kernels, p->model, column, &got);
+    run(reference, p->model, column, &expected);
+    for (unsigned k = 0; k < UPB_WINDOWS; k++)
+        compare_lane(p, column, &got, &expected, k);
+}
+
+static void check_round(parameters *p, random_source *random, upb_cpu cpu, const upb_kernels *reference) {
+    static upb_model_f32 model;
+    upb_kernels kernels;
+    if (!CHECK(upb_kernels_select(&kernels, cpu) == cpu))
+        return;
+    random_model_f32(random, &model, 1 + p->round % UPB_MAX_HIDDEN);
+    p->model = &model;
+    p->cpu_name = cpu_names[cpu];
+    for (unsigned i = 0; i < 3 * PATTERNS * PATTERNS; i++) {
+        raw_column column[3];
+        /* every pattern in the middle beside every pattern left and right, in some mixture */
+        const unsigned middle = i % PATTERNS, left = i / PATTERNS % PATTERNS;
+        pattern_column(random, left, &model, &column[0]);
+        pattern_column(random, middle, &model, &column[1]);
+        pattern_column(random, random_below(random, PATTERNS), &model, &column[2]);
+        p->pattern = patterns[middle];
+        compare_kernels(p, &kernels, reference, column);
+    }
+}
+
+/* ------------------------------------------------------------------------------------ the reference itself */
+
+/* The plain C kernel against values worked out by hand: y is the sum of the taps, weighted by powers of ten. */
+static void check_reference_by_hand(const upb_kernels *kernels) {
+    static upb_model_f32 model;
+    memset(&model, 0, sizeof model);
+    for (int n = 0; n < 2; n++) {
+        model.network[n].hidden = 1;
+        model.network[n].unit[0][UPB_UNIT_OUTPUT] = 1.0f;
+    }
+    model.min_count = 2;
+    model.max_count = 60000;
+    model.fill = 1;
+    const float weights[UPB_TAPS] = {1, 10, 100, 1000, 10000, 0, 0};
+    memcpy(model.network[0].unit[0], weights, sizeof weights);
+    model.network[1].offset = -3;
+    model.network[1].skip = 1;
+    raw_column column[3];
+    memset(column, 0, sizeof column);
+    column[0].distance[0] = 2, column[1].distance[0] = 3, column[2].distance[0] = 4; /* beam 0: 2 3 4 */
+    column[0].distance[1] = 5, column[1].distance[1] = 1, column[2].distance[1] = 3; /* beam 1: 5 - 3, 1 is too near */
+    column[0].intensity[0] = 9, column[1].intensity[0] = 8, column[2].intensity[0] = 7;
+    column[0].intensity[1] = 10, column[1].intensity[1] = 1, column[2].intensity[1] = 11;
+    column[0].distance[3] = 4, column[2].distance[3] = 2; /* windows 2 and 3: the middle column is empty */
+    result out;
+    run(kernels, &model, column, &out);
+    CHECK_EQUAL(out.raw[0][0], 2 + 30 + 400 + 5000 + 30000);
+    CHECK_EQUAL(out.distance[0], 35432);
+    CHECK_EQUAL(out.intensity[0], 7 - 3);
+    CHECK_EQUAL(out.raw[0][2], 4 + 20 + 200 + 4000 + 20000); /* both rows 4 2 2 */
+    CHECK_EQUAL(out.raw[0][1], 5 + 30 + 300 + 5000 + 30000); /* beam 1 alone: 5 3 3 */
+    CHECK_EQUAL(out.distance[5], 0);
+    CHECK_EQUAL(out.intensity[2], 0);
+    model.fill = 0;
+    run(kernels, &model, column, &out);
+    CHECK_EQUAL(out.raw[0][0], 2 + 30 + 400 + 5000);
+    CHECK_EQUAL(out.raw[0][2], 4000);
+    CHECK_EQUAL(out.raw[0][3], 4 + 200);
+}
+
+/* --------------------------------------------------------------------------------------------- benchmark */
+
+static double seconds_now(void) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+static int compare_doubles(const void *a, const void *b) {
+    const double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+enum { BENCH_COLUMNS = 2048, BENCH_RUNS = 51, BENCH_HIDDEN = 12 };
+
+/* Seconds for BENCH_COLUMNS columns: preparing each, and both networks on its windows. */
+static double time_image(const upb_kernels *kernels, const upb_model_f32 *model, const raw_column *columns) {
+    static upb_prepared_f32 prepared[3];
+    static uint16_t distance[BENCH_COLUMNS][UPB_LANES];
+    static uint8_t intensity[BENCH_COLUMNS][UPB_LANES];
+    const double start = seconds_now();
+    for (unsigned c = 0; c < BENCH_COLUMNS; c++) {
+        kernels->prepare_f32(&prepared[c % 3], model, columns[c].distance, columns[c].intensity);
+        kernels->windows_f32(model, &prepared[(c + 1) % 3], &prepared[(c + 2) % 3], &prepared[c % 3], distance[c],
+                             intensity[c]);
+    }
+    return seconds_now() - start;
+}
+
+static void bench(upb_cpu cpu, random_source *random) {
+    static raw_column columns[BENCH_COLUMNS];
+    static upb_model_f32 model;
+    double seconds[BENCH_RUNS];
+    upb_kernels kernels;
+    if (upb_kernels_select(&kernels, cpu) != cpu)
+        return;
+    random_model_f32(random, &model, BENCH_HIDDEN);
+    model.network[UPB_INTENSITY].hidden = BENCH_HIDDEN;
+    model.fill = 1;
+    for (unsigned c = 0; c < BENCH_COLUMNS; c++)
+        pattern_column(random, c % 2, &model, &columns[c]);
+    for (unsigned i = 0; i < BENCH_RUNS; i++)
+        seconds[i] = time_image(&kernels, &model, columns);
+    qsort(seconds, BENCH_RUNS, sizeof seconds[0], compare_doubles);
+    const double least = seconds[0], median = seconds[BENCH_RUNS / 2];
+    printf("%-8s %9.1f %9.1f ns per column, %8.3f %8.3f ms per image of %d columns (min, median; measured)\n",
+           cpu_names[cpu], least / BENCH_COLUMNS * 1e9, median / BENCH_COLUMNS * 1e9, least * 1e3, median * 1e3,
+           BENCH_COLUMNS);
+}
+
+int main(int argc, char **argv) {
+    parameters p = {.seed = option_number(argc, argv, "--seed", (unsigned long)time(NULL))};
+    const unsigned rounds = (unsigned)option_number(argc, argv, "--rounds", 2 * UPB_MAX_HIDDEN);
+    random_source random = random_seeded(p.seed);
+    upb_kernels reference;
+    printf("checkkernels --seed %lu --rounds %u\n", p.seed, rounds);
+    CHECK(upb_kernels_select(&reference, UPB_CPU_SCALAR) == UPB_CPU_SCALAR);
+    for (int cpu = UPB_CPU_SCALAR; cpu <= UPB_CPU_NEON; cpu++) {
+        upb_kernels kernels;
+        if (upb_kernels_select(&kernels, (upb_cpu)cpu) != (upb_cpu)cpu) {
+            printf("%-8s not on this machine or not in this build\n", cpu_names[cpu]);
+            continue;
+        }
+        const unsigned long long windows_before = windows_compared, flips_before = flips;
+        check_reference_by_hand(&kernels);
+        for (p.round = 0; cpu != UPB_CPU_SCALAR && p.round < rounds; p.round++)
+            check_round(&p, &random, (upb_cpu)cpu, &reference);
+        printf("%-8s %llu windows, %llu flips at thresholds\n", cpu_names[cpu], windows_compared - windows_before,
+               flips - flips_before);
+        if (option_given(argc, argv, "--bench"))
+            bench((upb_cpu)cpu, &random);
+    }
+    CHECK(flips * 100000 <= windows_compared); /* 10 per million */
+    return check_report("checkkernels");
+}
