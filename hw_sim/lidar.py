@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-
 from upbeam.model.beams import BeamTable
 
 from .ground import Ground

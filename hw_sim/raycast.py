@@ -338,8 +338,6 @@ def _ground_bracket(rays: Rays, ground: Ground, flat: F32, max_range_m: float) -
     index = (crest[None] < slope[..., None]).sum(axis=-1)
     edges = np.concatenate([[np.float32(0.5)], steps, [np.float32(np.inf)] * 2]).astype(np.float32)
     wide = np.repeat(index, every, axis=1)[:, : rays.shape[1]]
-    if wide.shape[1] < rays.shape[1]:
-        wide = np.pad(wide, ((0, 0), (0, rays.shape[1] - wide.shape[1])), mode="edge")
     return edges[wide], edges[wide + 1]
 
 

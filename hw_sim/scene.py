@@ -339,7 +339,9 @@ def _traffic(rng: Rng, style: _Style, street: _Street, lane: float, speed: float
         movers.append(Mover(objects.pedestrian(rng), x, side * out, walk))
     for x in _poisson(rng, style.people * 0.2, street):
         side = 1.0 if rng.random() < 0.5 else -1.0
-        movers.append(Mover(objects.cyclist(rng), x, side * (street.half - 2.3), -side * float(rng.uniform(3, 6))))
+        # Beside the parked cars, or at the kerb: clear of the lanes.
+        out = street.half - (2.3 if street.parked else 0.5)
+        movers.append(Mover(objects.cyclist(rng), x, side * out, -side * float(rng.uniform(3, 6))))
     return movers
 
 

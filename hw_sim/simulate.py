@@ -10,7 +10,6 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
-
 from upbeam.model.beams import BeamTable
 
 from .lidar import Lidar, LidarConfig, Scan
@@ -65,6 +64,7 @@ def simulate_frames(
 ) -> Iterator[Scan]:
     """Yield ``frames`` scans; the same arguments give the same bits.
 
+    That holds for one kind of CPU and one NumPy version: vectorised sines differ between them in the last place.
     ``scene``: one of ``SCENE_KINDS``, a ``Scene`` of your own, or None to draw the kind from the seed. With
     ``frames_per_scene=None`` the vehicle drives on without a break, one turn after the other; otherwise every
     ``frames_per_scene`` frames a new street begins, and frames within one street are half a second apart.

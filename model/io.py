@@ -122,7 +122,7 @@ def read_npy(path: str | Path, intensity_scale: float | None = None) -> Points |
 
     * ``.npy``, float, ``[N, 4]``: a cloud, given as ``float32[N, 4]`` with intensity 0..1 (so no image of 4 columns);
     * ``.npy``, ``[rows, W]``: a range image, uint16 counts or float metres, without intensity;
-    * ``.npy``, ``[2, rows, W]``, else ``[rows, W, 2]``: distance and intensity;
+    * ``.npy``, ``[rows, W, 2]``, else ``[2, rows, W]``: distance and intensity (no image is 2 columns wide);
     * ``.npz``: a range image in the arrays ``distance`` and, if there, ``intensity``; others are left alone.
 
     Intensities: see the module. Raises CloudError for other shapes and types, and for distances that are negative or
@@ -140,10 +140,10 @@ def read_npy(path: str | Path, intensity_scale: float | None = None) -> Points |
         return _finish_cloud(path, points, _full_intensity(path, points[:, 3], False, intensity_scale))
     if array.ndim == 2:
         return _range_arrays(path, array, None, intensity_scale)
-    if array.ndim == 3 and array.shape[0] == 2:
-        return _range_arrays(path, array[0], array[1], intensity_scale)
     if array.ndim == 3 and array.shape[2] == 2:
         return _range_arrays(path, array[:, :, 0], array[:, :, 1], intensity_scale)
+    if array.ndim == 3 and array.shape[0] == 2:
+        return _range_arrays(path, array[0], array[1], intensity_scale)
     raise CloudError(
         path, f"an array of shape {list(array.shape)}", "header", "[N, 4], [rows, W], [2, rows, W] or [rows, W, 2]"
     )
@@ -268,8 +268,7 @@ def _read(path: Path) -> bytes:
             raise CloudError(path, "not a regular file", "file", "a file that can be read")
         if status.st_size > MAX_FILE_BYTES:
             raise CloudError(path, f"{status.st_size} bytes", "file", f"at most {MAX_FILE_BYTES} bytes")
-        with path.open("rb") as file:
-            data = file.read(MAX_FILE_BYTES)
+        data = path.read_bytes()
     except CloudError:
         raise
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL byte
@@ -383,8 +382,8 @@ def _float32(path: Path, array: NDArray[Any], where: str) -> NDArray[np.float32]
 def _range_arrays(
     path: Path, distance: NDArray[Any], intensity: NDArray[Any] | None, intensity_scale: float | None
 ) -> RangeArrays:
-    if distance.ndim != 2 or distance.size == 0:
-        raise CloudError(path, f"distance of shape {list(distance.shape)}", "header", "[rows, W], not empty")
+    if distance.ndim != 2 or distance.shape[0] < 1 or distance.shape[1] < 4:
+        raise CloudError(path, f"distance of shape {list(distance.shape)}", "header", "[rows, W], W at least 4")
     if distance.dtype.kind == "f":
         bad = ~((distance >= 0) & np.isfinite(distance))
         if bad.any():

@@ -219,7 +219,7 @@ def load_state_dict(path: str | Path, **graph: Any) -> WindowNetwork:
     path = Path(path)
     try:
         if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 return from_state_dict(dict(archive), **graph)
         if path.suffix in {".pt", ".pth"}:
             return from_state_dict(_torch_load(path), **graph)

@@ -39,7 +39,7 @@ static void fill_columns(float x[3], const int empty[3]) {
         x[1] = empty[0] ? right : empty[2] ? left : least(left, right);
 }
 
-/* The window of lane k: x[0..2] top row, x[3..5] bottom row, x[6] minimum; `first` is the top row of a prepared column. */
+/* The window of lane k: top row, bottom row, minimum; `first` is the top row of a prepared column. */
 static void gather(float x[UPB_TAPS], const upb_model_f32 *model, const upb_prepared_f32 *const column[3], int first,
                    unsigned k) {
     int empty[3];
@@ -52,13 +52,15 @@ static void gather(float x[UPB_TAPS], const upb_model_f32 *model, const upb_prep
         fill_columns(x, empty);
         fill_columns(x + 3, empty);
     }
-    x[6] = x[0];
-    for (int i = 1; i < 6; i++)
-        x[6] = least(x[6], x[i]);
+    x[UPB_TAP_MINIMUM] = x[0];
+    for (int i = 1; i < UPB_TAP_MINIMUM; i++)
+        x[UPB_TAP_MINIMUM] = least(x[UPB_TAP_MINIMUM], x[i]);
+    for (int i = 0; i < UPB_TAP_MINIMUM; i++)
+        x[i] -= x[UPB_TAP_MINIMUM]; /* exact: whole numbers below 2^16 */
 }
 
 static float network(const upb_network_f32 *net, const float x[UPB_TAPS]) {
-    float y = net->offset + net->skip * x[6];
+    float y = net->offset;
     for (uint32_t h = 0; h < net->hidden; h++) {
         const float *unit = net->unit[h];
         float sum = unit[UPB_UNIT_BIAS];
@@ -67,6 +69,7 @@ static float network(const upb_network_f32 *net, const float x[UPB_TAPS]) {
         float bent = net->slope * sum;
         y += unit[UPB_UNIT_OUTPUT] * (sum > bent ? sum : bent);
     }
+    y += net->skip * x[UPB_TAP_MINIMUM]; /* last, for it is large: small terms added to it would each be rounded */
     return net->positive && y < 0.0f ? 0.0f : y;
 }
 
@@ -77,7 +80,7 @@ static void windows_f32_c(const upb_model_f32 *model, const upb_prepared_f32 *le
         float x[UPB_TAPS];
         gather(x, model, column, UPB_DISTANCE_TOP, k);
         float d = floorf(network(&model->network[UPB_DISTANCE], x) + 0.5f);
-        int seen = !model->fill || x[0] != 0.0f; /* filled: 0 only if the whole window is empty */
+        int seen = !model->fill || x[UPB_TAP_MINIMUM] != 0.0f; /* filled: 0 only if the whole window is empty */
         int given = seen && d >= model->min_count && d <= model->max_count;
         gather(x, model, column, UPB_INTENSITY_TOP, k);
         float i = floorf(network(&model->network[UPB_INTENSITY], x) + 0.5f);

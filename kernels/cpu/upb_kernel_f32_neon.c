@@ -30,6 +30,7 @@ static inline void store_u8(uint8_t *p, float32x4_t v) {
 #define V_STORE_U8(p, v) store_u8(p, v)
 #define V_SET(x) vdupq_n_f32(x)
 #define V_ADD(a, b) vaddq_f32(a, b)
+#define V_SUB(a, b) vsubq_f32(a, b)
 #define V_MUL(a, b) vmulq_f32(a, b)
 #define V_MIN(a, b) vminq_f32(a, b)
 #define V_MAX(a, b) vmaxq_f32(a, b)

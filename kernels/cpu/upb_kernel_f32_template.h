@@ -8,7 +8,7 @@
  *   V_LOAD_U16(p), V_LOAD_U8(p)   V_LANES integers as floats, unaligned
  *   V_STORE_U16(p, v), V_STORE_U8(p, v)   the same way back; v is whole and in range
  *   V_SET(x)             all lanes x
- *   V_ADD, V_MUL, V_MIN, V_MAX (a, b);  V_FMA(a, b, c): a * b + c, rounded once;  V_FLOOR(v)
+ *   V_ADD, V_SUB, V_MUL, V_MIN, V_MAX (a, b);  V_FMA(a, b, c): a * b + c, rounded once;  V_FLOOR(v)
  *   M_IS_ZERO(v), M_BETWEEN(v, low, high), M_AND_NOT(m, n): m and not n;  V_SELECT(m, yes, no)
  *   UPB_FILL_KERNELS     the name of the function that hands the kernels out
  *
@@ -17,7 +17,7 @@
 #include "upb_kernels.h"
 
 typedef struct window {
-    V x[UPB_TAPS]; /* top row, bottom row, minimum */
+    V x[UPB_TAPS];
 } window;
 
 static void prepare_f32(upb_prepared_f32 *prepared, const upb_model_f32 *model, const uint16_t *distance,
@@ -53,7 +53,7 @@ static inline void fill_columns(V x[3], const M empty[3]) {
     x[2] = V_SELECT(empty[2], V_SELECT(empty[1], left, middle), right);
 }
 
-/* V_BLOCK windows vectors from lane k on; `first` is the top row of a prepared column. */
+/* The windows of V_BLOCK vectors from lane k on; `first` is the top row of a prepared column. */
 static inline void gather(window *w, const upb_model_f32 *model, const upb_prepared_f32 *const column[3], int first,
                           unsigned k) {
     for (unsigned b = 0; b < V_BLOCK; b++) {
@@ -68,14 +68,17 @@ static inline void gather(window *w, const upb_model_f32 *model, const upb_prepa
             fill_columns(x, empty);
             fill_columns(x + 3, empty);
         }
-        x[6] = V_MIN(V_MIN(V_MIN(x[0], x[1]), V_MIN(x[2], x[3])), V_MIN(x[4], x[5]));
+        V minimum = V_MIN(V_MIN(V_MIN(x[0], x[1]), V_MIN(x[2], x[3])), V_MIN(x[4], x[5]));
+        for (int i = 0; i < UPB_TAP_MINIMUM; i++)
+            x[i] = V_SUB(x[i], minimum);
+        x[UPB_TAP_MINIMUM] = minimum;
     }
 }
 
 static inline void network(V *y, const upb_network_f32 *net, const window *w) {
     const V slope = V_SET(net->slope);
     for (unsigned b = 0; b < V_BLOCK; b++)
-        y[b] = V_FMA(V_SET(net->skip), w[b].x[6], V_SET(net->offset));
+        y[b] = V_SET(net->offset);
     for (uint32_t h = 0; h < net->hidden; h++) {
         const float *unit = net->unit[h];
         V sum[V_BLOCK];
@@ -87,6 +90,8 @@ static inline void network(V *y, const upb_network_f32 *net, const window *w) {
         for (unsigned b = 0; b < V_BLOCK; b++)
             y[b] = V_FMA(V_SET(unit[UPB_UNIT_OUTPUT]), V_MAX(sum[b], V_MUL(slope, sum[b])), y[b]);
     }
+    for (unsigned b = 0; b < V_BLOCK; b++)
+        y[b] = V_FMA(V_SET(net->skip), w[b].x[UPB_TAP_MINIMUM], y[b]);
     if (net->positive)
         for (unsigned b = 0; b < V_BLOCK; b++)
             y[b] = V_MAX(y[b], V_SET(0.0f));
@@ -108,7 +113,7 @@ static void windows_f32(const upb_model_f32 *model, const upb_prepared_f32 *left
             V d = round_half_up(y[b]);
             given[b] = M_BETWEEN(d, low, high);
             if (model->fill)
-                given[b] = M_AND_NOT(given[b], M_IS_ZERO(w[b].x[0]));
+                given[b] = M_AND_NOT(given[b], M_IS_ZERO(w[b].x[UPB_TAP_MINIMUM]));
             V_STORE_U16(distance + k + b * V_LANES, V_SELECT(given[b], d, zero));
         }
         gather(w, model, column, UPB_INTENSITY_TOP, k);

@@ -5,7 +5,8 @@
  * of every array below is window k. Lane 31 is padding: it holds finite values of no meaning, and nobody reads its result.
  *
  * All distances are in counts (the sensor's units), all intensities in their 8-bit steps; the size of a count is folded
- * into the weights when the model is loaded. The meaning of the rules is in docs/model-format.md.
+ * into the weights when the model is loaded. So is the step from the file's pixels to differences from the window
+ * minimum: these are exact, and smaller, which leaves less to be rounded. The rules are in docs/model-format.md.
  */
 #ifndef UPB_KERNELS_H
 #define UPB_KERNELS_H
@@ -15,14 +16,15 @@
 #include "upbeam/upbeam.h"
 
 #define UPB_LANES 32u /* UPB_WINDOWS and one lane of padding */
-#define UPB_TAPS 7    /* inputs of a network: six window pixels and their minimum */
+#define UPB_TAPS 7    /* inputs of a network: six window pixels, as differences from their minimum, and the minimum */
+#define UPB_TAP_MINIMUM 6
 
 /* Places in a row of upb_network_f32.unit. */
 enum { UPB_UNIT_BIAS = UPB_TAPS, UPB_UNIT_OUTPUT = UPB_TAPS + 1, UPB_UNIT_FLOATS = 16 };
 
 /*
- * One network, folded: y = offset + skip * min + sum over h of OUTPUT[h] * leaky(BIAS[h] + sum over i of unit[h][i] * x[i]).
- * One hidden unit is one cache line: seven weights, bias, output weight, zeros.
+ * One network, folded: y = offset + sum over h of OUTPUT[h] * leaky(BIAS[h] + sum over i of unit[h][i] * x[i]) + skip * min,
+ * in this order. One hidden unit is one cache line: seven weights, bias, output weight, zeros.
  * Values: finite, magnitudes below 1e11; slope 0..1. Inputs are at most 65535, so that no sum overflows.
  */
 typedef struct upb_network_f32 {

@@ -301,15 +301,20 @@ static upb_status read_network(const reader *r, unsigned network, size_t *at, si
     return read_float(r, network, ".c", c, &net->offset);
 }
 
-/* From metres in and out to counts: the kernels then need no multiplication by the unit. */
-static void fold_unit(upb_network_f32 *net, uint32_t unit_um) {
-    const double unit_m = unit_um * 1e-6;
+/*
+ * From the file's network to the kernels' (upb_kernels.h): `unit` is the size of a count in what the file's network sees
+ * and gives. A network on pixels x is one on differences x - min whose weight of the minimum is the sum of all.
+ */
+static void fold(upb_network_f32 *net, double unit) {
     for (uint32_t h = 0; h < net->hidden; h++) {
-        for (int i = 0; i < UPB_TAPS; i++)
-            net->unit[h][i] = (float)(net->unit[h][i] * unit_m);
-        net->unit[h][UPB_UNIT_OUTPUT] = (float)(net->unit[h][UPB_UNIT_OUTPUT] / unit_m);
+        double sum = 0;
+        for (int i = 0; i < UPB_TAPS; i++) {
+            sum += (double)net->unit[h][i];
+            net->unit[h][i] = (float)((i == UPB_TAP_MINIMUM ? sum : (double)net->unit[h][i]) * unit);
+        }
+        net->unit[h][UPB_UNIT_OUTPUT] = (float)((double)net->unit[h][UPB_UNIT_OUTPUT] / unit);
     }
-    net->offset = (float)(net->offset / unit_m);
+    net->offset = (float)((double)net->offset / unit);
 }
 
 static upb_status read_networks(const reader *r, const section *s, upb_model *model) {
@@ -326,7 +331,8 @@ static upb_status read_networks(const reader *r, const section *s, upb_model *mo
         return status;
     if (at != end)
         return bad_value(r, "NETW.bytes", s->offset, s->bytes, at - s->offset);
-    fold_unit(&model->f32.network[UPB_DISTANCE], model->info.distance_unit_um);
+    fold(&model->f32.network[UPB_DISTANCE], model->info.distance_unit_um * 1e-6);
+    fold(&model->f32.network[UPB_INTENSITY], 1);
     return UPB_OK;
 }
 

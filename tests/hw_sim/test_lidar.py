@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from upbeam.hw_sim import (
     SCENE_KINDS,
     Ground,
@@ -99,7 +98,8 @@ def test_azimuth_runs_clockwise_from_the_cut(x: float, y: float, azimuth: float)
 def test_points_are_where_things_stand() -> None:
     points = Lidar(ideal(VLP32), box_scene(9.0, 12.0)).scan(0).points()
     assert len(points) > 20
-    assert np.all(np.abs(points[:, 0] - 9) < 1.01) and np.all(np.abs(points[:, 1] - 12) < 1.01)
+    assert np.all(np.abs(points[:, 0] - 9) < 1.01)
+    assert np.all(np.abs(points[:, 1] - 12) < 1.01)
 
 
 def test_solids_at_right_angles() -> None:
@@ -127,7 +127,8 @@ def test_firing_columns_shift_by_the_offset_and_aligned_undoes_it() -> None:
         at = np.flatnonzero(firing.distance[beam]).mean() - np.flatnonzero(direct.distance[beam]).mean()
         assert at == pytest.approx(-shift[beam], abs=1.0)
     back = firing.aligned()
-    assert back.alignment == "azimuth" and back.aligned() is back
+    assert back.alignment == "azimuth"
+    assert back.aligned() is back
     both = (back.distance > 0) & (direct.distance > 0)
     assert both.sum() > 0.97 * (direct.distance > 0).sum()
     # Whole columns leave up to half a column of azimuth error: 0.18 degrees, 4 cm on the box's slanted side.
@@ -193,8 +194,8 @@ def _slow_depth(rays: Rays, scene_ground: Ground, primitives, max_range: float, 
     return float(t[first]) if inside[first] else np.inf
 
 
-def _cast_inputs(kind: str, align: bool, frame: int, table: BeamTable = HDL64):  # type: ignore[no-untyped-def]
-    config = LidarConfig(table, columns=256, align=align, rate_hz=10.0)
+def _cast_inputs(kind: str, align: bool, frame: int, table: BeamTable = HDL64, columns: int = 256):  # type: ignore[no-untyped-def]
+    config = LidarConfig(table, columns=columns, align=align, rate_hz=10.0)
     scene = street_scene(kind, 5, seconds=5.0)
     lidar = Lidar(config, scene)
     middle = (frame + 0.5) / config.rate_hz
@@ -214,6 +215,14 @@ def test_windows_lose_no_hit(kind: str, align: bool) -> None:
         np.testing.assert_array_equal(fast, slow)
         assert (fast_hit != slow_hit).sum() <= 4  # equal depths may name either primitive
         assert (fast_hit > GROUND).any()
+
+
+def test_windows_lose_no_hit_at_odd_widths() -> None:
+    rays, ground, found = _cast_inputs("city", False, 3, VLP32, 1085)
+    chance = np.random.default_rng(0).random(rays.shape, dtype=np.float32)
+    np.testing.assert_array_equal(
+        cast(rays, ground, found, chance, 120.0)[0], cast(rays, ground, found, chance, 120.0, windows=False)[0]
+    )
 
 
 @pytest.mark.parametrize("kind", SCENE_KINDS)
@@ -251,10 +260,12 @@ def test_noise_has_the_stated_size_and_bias_stays() -> None:
 def test_losses_grow_with_range_and_with_grazing() -> None:
     config = replace(ideal(LEVEL), dropout_weak=1.0, dropout=0.02)
     share = [(Lidar(config, wall_scene(d)).scan(0).distance[:, 248:264] > 0).mean() for d in (10.0, 60.0, 110.0)]
-    assert share[0] > 0.94 and share[0] > share[1] + 0.05 > share[2]
+    assert share[0] > 0.94
+    assert share[0] > share[1] + 0.05 > share[2]
     ground = Lidar(replace(config, beams=HDL64), Scene(Ground())).scan(0).distance > 0
     fill = ground.mean(axis=1)
-    assert fill[40:].mean() > 0.96 and fill[9] < fill[40:].mean() - 0.05
+    assert fill[40:].mean() > 0.96
+    assert fill[9] < fill[40:].mean() - 0.05
 
 
 def test_counts_stay_in_bounds_and_overflow_is_counted() -> None:
@@ -264,10 +275,13 @@ def test_counts_stay_in_bounds_and_overflow_is_counted() -> None:
     coarse = Lidar(replace(ideal(LEVEL), max_range_m=500.0, distance_unit_m=0.004), wall_scene(140.0)).scan(0)
     assert int(coarse.distance[16, 256]) == pytest.approx(35000, abs=3)
     scan = next(iter(simulate_frames(HDL64, columns=512, frames=1, seed=1)))
-    assert scan.distance.dtype == np.uint16 and scan.intensity.dtype == np.uint8
+    assert scan.distance.dtype == np.uint16
+    assert scan.intensity.dtype == np.uint8
     metres = scan.distance_m()[scan.distance > 0]
-    assert metres.min() >= 0.99 and metres.max() <= 120.5
-    assert not scan.intensity[scan.distance == 0].any() and not scan.surface[scan.distance == 0].any()
+    assert metres.min() >= 0.99
+    assert metres.max() <= 120.5
+    assert not scan.intensity[scan.distance == 0].any()
+    assert not scan.surface[scan.distance == 0].any()
     assert (scan.surface[scan.distance > 0] > 0).all()
 
 

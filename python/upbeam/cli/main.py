@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from typing import Annotated
 
-import click
 import typer
 
 import upbeam
@@ -18,7 +17,6 @@ __all__ = ["app", "run"]
 app = typer.Typer(
     name="upbeam",
     help="Turns a 32-beam LiDAR into a 64-beam one. Every command takes --json.",
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -46,23 +44,29 @@ def _options(
     pass
 
 
+# Typer has its own copy of click in some versions: take the base class of all usage errors from what it exports.
+_UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+
+
 def run() -> None:
     """The console script: every error a user can cause becomes one line and status 2."""
+    arguments = sys.argv[1:]
     try:
-        status = app(standalone_mode=False)
-    except click.exceptions.NoArgsIsHelpError as error:
-        error.show()
+        status = app(arguments or ["--help"], standalone_mode=False)
+    except _UsageError as error:
+        message(f"upbeam: {_one_line(error.format_message())}")  # type: ignore[attr-defined]
         sys.exit(2)
-    except click.ClickException as error:
-        message(f"upbeam: {error.format_message()}")
-        sys.exit(2)
-    except (KeyboardInterrupt, click.Abort):
+    except (KeyboardInterrupt, typer.Abort):
         message("upbeam: interrupted")
         sys.exit(130)
     except OSError as error:
         message(f"upbeam: {error.filename or ''}{': ' if error.filename else ''}{error.strerror or error}")
         sys.exit(2)
     except ValueError as error:
-        message(f"upbeam: {error}")
+        message(f"upbeam: {_one_line(str(error))}")
         sys.exit(2)
-    sys.exit(status or 0)
+    sys.exit(status if arguments else 2)
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

@@ -5,9 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 
-import numpy as np
-from numpy.typing import NDArray
-
 from upbeam.hw_sim import Scan, simulate_frames, simulate_parallel
 from upbeam.model.beams import BeamTable
 from upbeam.model.frames import Frame, kitti_frames
@@ -52,7 +49,3 @@ def _source_frames(source: DataRecipe, recipe: Recipe, beams: BeamTable, rules: 
     )
     yield from map(frame_of_scan, scans)
 
-
-def firing_columns(image: NDArray[np.generic]) -> NDArray[np.generic]:
-    """A range image [32, W] as columns [W, 32], the order in which a sensor delivers it."""
-    return np.ascontiguousarray(image.T)

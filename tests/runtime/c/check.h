@@ -71,6 +71,14 @@ static inline unsigned long option_number(int argc, char **argv, const char *nam
     return otherwise;
 }
 
+/* The text after `name` on the command line, or null. */
+static inline const char *option_text(int argc, char **argv, const char *name) {
+    for (int i = 1; i + 1 < argc; i++)
+        if (strcmp(argv[i], name) == 0)
+            return argv[i + 1];
+    return NULL;
+}
+
 static inline int option_given(int argc, char **argv, const char *name) {
     for (int i = 1; i < argc; i++)
         if (strcmp(argv[i], name) == 0)
