@@ -44,6 +44,8 @@ class FoldedNetwork:
     output_bias: float
     skip: float
     slope: float
+    positive: bool = True
+    """The output is ``max(y, 0)``."""
 
     @property
     def hidden(self) -> int:
@@ -63,7 +65,8 @@ class FoldedNetwork:
         """``windows[..., 6]`` -> ``y[...]``, in float64."""
         x = _with_minimum(windows)
         hidden = _leaky(x @ self.weight.T + self.bias, self.slope)
-        return np.maximum(hidden @ self.output_weight + self.output_bias + self.skip * x[..., -1], 0.0)
+        y = np.asarray(hidden @ self.output_weight + self.output_bias + self.skip * x[..., -1])
+        return np.maximum(y, 0.0) if self.positive else y
 
     def magnitude(self, windows: ArrayLike) -> FloatArray:
         """Sum of |w x| over the whole graph: the scale that rounding errors are measured against."""

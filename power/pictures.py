@@ -86,7 +86,9 @@ def plot_latency_histogram(latencies_ms: Sequence[float], deadline_ms: float, la
     axes = figure.add_subplot()
     low = values.min() * 0.3 if values.size else deadline_ms / 1000
     high = max(deadline_ms * 1.6, values.max() * 1.2 if values.size else 0.0)
-    axes.hist(values, bins=list(np.geomspace(low, high, 90)), color="#4c78a8", edgecolor="#1f3a57", linewidth=0.4)
+    if values.size:
+        axes.hist(values, bins=list(np.geomspace(low, high, 90)), color="#4c78a8", edgecolor="#1f3a57", linewidth=0.4)
+        _mark_quantiles(axes, values)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(0.7, max(10.0, values.size * 1.6))
@@ -94,8 +96,6 @@ def plot_latency_histogram(latencies_ms: Sequence[float], deadline_ms: float, la
     axes.grid(axis="x", which="both", color=GRID, linewidth=0.5)
     axes.set_axisbelow(True)
     _mark(axes, deadline_ms, f"deadline {deadline_ms:g} ms", "-")
-    if values.size:
-        _mark_quantiles(axes, values)
     _plain_ticks(axes.xaxis)
     _plain_ticks(axes.yaxis)
     axes.set_xlabel("latency of a frame, last input column received to last output column complete (ms)")

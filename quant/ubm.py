@@ -103,6 +103,7 @@ def _as_stored(network: FoldedNetwork) -> FoldedNetwork:
         output_bias=float(f32(network.output_bias)),
         skip=float(f32(network.skip)),
         slope=float(f32(network.slope)),
+        positive=network.positive,
     )
 
 
@@ -151,7 +152,7 @@ def _pack_netw(networks: tuple[FoldedNetwork, FoldedNetwork]) -> bytes:
     for network in networks:
         if not 1 <= network.hidden <= MAX_HIDDEN:
             raise UbmError(f"{network.hidden} hidden units, expected 1 to {MAX_HIDDEN}")
-        out += struct.pack("<IIff", network.hidden, 1, network.slope, network.skip)
+        out += struct.pack("<IIff", network.hidden, int(network.positive), network.slope, network.skip)
         out += _floats(network.weight, network.bias, network.output_weight, [network.output_bias])
     return out
 
@@ -196,10 +197,10 @@ class _Cursor:
         return value
 
     def floats(self, what: str, *shape: int, limit: float = MAX_WEIGHT) -> NDArray[np.float64]:
-        array = np.frombuffer(self.take(4 * int(np.prod(shape))), dtype="<f4").astype(np.float64)
-        if not np.all(np.isfinite(array)) or np.any(np.abs(array) > limit):
+        stored = np.frombuffer(self.take(4 * int(np.prod(shape))), dtype="<f4")
+        if not np.all(np.isfinite(stored)) or np.any(np.abs(stored) > np.float32(limit)):
             raise UbmError(f"section {self.tag}: {what} holds a value that is not finite or beyond +-{limit:g}")
-        return array.reshape(shape)
+        return stored.astype(np.float64).reshape(shape)
 
     def end(self) -> None:
         if self.at != len(self.data):
@@ -237,6 +238,8 @@ def _sections(data: bytes) -> dict[str, bytes]:
     stored = struct.unpack_from("<I", data, total - 4)[0]
     if zlib.crc32(data[:-4]) != stored:
         raise UbmError(f"checksum {zlib.crc32(data[:-4]):08x}, expected {stored:08x}: the file is damaged")
+    if any(data[16:HEADER_BYTES]):
+        raise UbmError("reserved bytes of the header are not 0")
     if not 1 <= count <= MAX_SECTIONS or HEADER_BYTES + 16 * count + 4 > total:
         raise UbmError(f"{count} sections, expected 1 to {MAX_SECTIONS}")
     out: dict[str, bytes] = {}
@@ -244,15 +247,24 @@ def _sections(data: bytes) -> dict[str, bytes]:
     for k in range(count):
         raw_tag, flags, offset, size = struct.unpack_from("<4s3I", data, HEADER_BYTES + 16 * k)
         tag = raw_tag.decode("ascii", errors="replace")
+        if not (tag.isascii() and tag.isprintable()) or flags & ~REQUIRED:
+            raise UbmError(f"entry {k} of the section table: tag {raw_tag!r}, flags {flags:#x}; expected 4 letters, 0 or 1")
         if offset % 8 or offset < free or offset + size > total - 4:
             raise UbmError(f"section {tag} at {offset} with {size} bytes lies outside the file, or overlaps")
         if tag in out:
             raise UbmError(f"section {tag} stands twice")
         if tag not in _KNOWN and flags & REQUIRED:
             raise UbmError(f"section {tag} is required and this program does not know it: a newer model file?")
+        _need_zeros(data, free, offset)
         out[tag] = data[offset : offset + size]
         free = offset + size
+    _need_zeros(data, free, total - 4)
     return out
+
+
+def _need_zeros(data: bytes, start: int, end: int) -> None:
+    if any(data[start:end]):
+        raise UbmError(f"bytes {start} to {end} lie between sections and are not 0")
 
 
 _KNOWN = {"SENS", "NETW", "DENS", "PROV", "METR"}
@@ -267,16 +279,27 @@ def _parse_sens(data: bytes) -> Rules:
         raise UbmError(f"section SENS: {beams} beams, expected {BEAMS}")
     if not 100 <= unit_um <= 100_000:
         raise UbmError(f"section SENS: distance unit {unit_um} um, expected 100 to 100000")
+    if cut >= 360_000:
+        raise UbmError(f"section SENS: cut {cut} thousandths of a degree, expected 0 to 359999")
+    if any(data[59:64]):
+        raise UbmError("section SENS: reserved bytes are not 0")
     if edge > 1 or last_row > 1 or empty > 1:
         raise UbmError(f"section SENS: unknown rule (edge {edge}, last row {last_row}, empty {empty}), expected 0 or 1")
-    angles = np.frombuffer(data, dtype="<i4", offset=64).astype(np.float64) / 1e6
+    millionths = np.frombuffer(data, dtype="<i4", offset=64).astype(np.float64) / 1e6
+    for key, values, limit in (
+        ("row elevation", millionths[:ROWS], 90),
+        ("azimuth_offset", millionths[ROWS : ROWS + BEAMS], 45),
+        ("row_height", millionths[ROWS + BEAMS :], 10),
+    ):
+        if np.any(np.abs(values) > limit):
+            raise UbmError(f"section SENS: {key} beyond +-{limit}")
     return Rules(
-        sensor=name.split(b"\0")[0].decode("ascii", errors="replace"),
+        sensor=_name(name),
         columns=columns,
         distance_unit_m=unit_um / 1e6,
-        row_elevation_deg=angles[:ROWS],
-        azimuth_offset_deg=angles[ROWS : ROWS + BEAMS],
-        row_height_m=angles[ROWS + BEAMS :],
+        row_elevation_deg=millionths[:ROWS],
+        azimuth_offset_deg=millionths[ROWS : ROWS + BEAMS],
+        row_height_m=millionths[ROWS + BEAMS :],
         min_count=low,
         max_count=high,
         cut_deg=cut / 1000.0,
@@ -286,12 +309,19 @@ def _parse_sens(data: bytes) -> Rules:
     )
 
 
+def _name(padded: bytes) -> str:
+    name = padded.rstrip(b"\0").decode("ascii", errors="replace")
+    if len(name) > 31 or not (name.isascii() and (name.isprintable() or not name)):
+        raise UbmError(f"section SENS: sensor name {padded!r}, expected at most 31 printable letters")
+    return name
+
+
 def _parse_netw(cursor: _Cursor) -> tuple[FoldedNetwork, FoldedNetwork]:
     cursor.u32("number of networks", 2, 2)
     networks = []
     for _ in range(2):
         hidden = cursor.u32("hidden units", 1, MAX_HIDDEN)
-        cursor.u32("flags", 1, 1)
+        positive = cursor.u32("flags", 0, 1)
         slope = float(cursor.floats("slope", 1, limit=1.0)[0])
         if slope < 0:
             raise UbmError(f"section NETW: slope is {slope}, expected 0 to 1")
@@ -304,6 +334,7 @@ def _parse_netw(cursor: _Cursor) -> tuple[FoldedNetwork, FoldedNetwork]:
                 output_bias=float(cursor.floats("c", 1)[0]),
                 skip=skip,
                 slope=slope,
+                positive=bool(positive),
             )
         )
     cursor.end()

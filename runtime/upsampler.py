@@ -10,7 +10,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from upbeam.model.geometry import to_counts
+from upbeam.model.geometry import to_counts, to_metres
 from upbeam.model.rules import BEAMS, ROWS, Rules
 from upbeam.quant.ubm import ModelFile, UbmError, read_ubm
 
@@ -142,7 +142,7 @@ class Upsampler:
             return self._stream.image(np.ascontiguousarray(d), np.ascontiguousarray(i))
         counts, _ = to_counts(d, self.model.distance_unit_m)
         out, grey = self._stream.image(counts, np.ascontiguousarray(i))
-        metres = out.astype(np.float32) * np.float32(self.model.distance_unit_m)
+        metres = to_metres(out, self.model.distance_unit_m)
         metres[0::2] = d
         if self.model.rules.last_row == "repeat":
             metres[-1] = d[-1]

@@ -204,32 +204,30 @@ static upb_status read_rules(const reader *r, size_t at, upb_model_info *info) {
     return UPB_OK;
 }
 
-static upb_status read_geometry(const reader *r, size_t at, upb_model_info *info) {
-    const int32_t top = 90000000, side = 45000000, high = 10000000;
-    int64_t above = (int64_t)top + 1;
-    for (unsigned row = 0; row < UPB_ROWS; row++, at += 4) {
-        int32_t elevation = i32_at(r, at);
-        if (elevation < -top || elevation >= above)
-            return bad_element(r, "SENS.elevation", row, at, (uint64_t)(int64_t)elevation,
-                               (uint64_t)(elevation < -top ? -(int64_t)top : above - 1));
-        info->row_elevation_udeg[row] = elevation;
-        above = elevation;
-    }
-    for (unsigned beam = 0; beam < UPB_BEAMS; beam++, at += 4) {
-        int32_t offset = i32_at(r, at);
-        if (offset < -side || offset > side)
-            return bad_element(r, "SENS.azimuth_offset", beam, at, (uint64_t)(int64_t)offset,
-                               (uint64_t)(int64_t)(offset < 0 ? -side : side));
-        info->azimuth_offset_udeg[beam] = offset;
-    }
-    for (unsigned row = 0; row < UPB_ROWS; row++, at += 4) {
-        int32_t height = i32_at(r, at);
-        if (height < -high || height > high)
-            return bad_element(r, "SENS.row_height", row, at, (uint64_t)(int64_t)height,
-                               (uint64_t)(int64_t)(height < 0 ? -high : high));
-        info->row_height_um[row] = height;
+/* `count` values within +-limit. */
+static upb_status read_signed(const reader *r, const char *what, size_t at, unsigned count, int32_t limit,
+                              int32_t *values) {
+    for (unsigned i = 0; i < count; i++) {
+        const int64_t value = values[i] = i32_at(r, at + 4 * i);
+        if (value < -limit || value > limit)
+            return bad_element(r, what, i, at + 4 * i, (uint64_t)value, (uint64_t)(int64_t)(value < 0 ? -limit : limit));
     }
     return UPB_OK;
+}
+
+static upb_status read_geometry(const reader *r, size_t at, upb_model_info *info) {
+    const int32_t *elevation = info->row_elevation_udeg;
+    const size_t offsets_at = at + UPB_ROWS * 4, heights_at = offsets_at + UPB_BEAMS * 4;
+    upb_status status = read_signed(r, "SENS.elevation", at, UPB_ROWS, 90000000, info->row_elevation_udeg);
+    for (unsigned row = 1; row < UPB_ROWS && status == UPB_OK; row++)
+        if (elevation[row] >= elevation[row - 1])
+            status = bad_element(r, "SENS.elevation", row, at + 4 * row, (uint64_t)(int64_t)elevation[row],
+                                 (uint64_t)((int64_t)elevation[row - 1] - 1));
+    if (status == UPB_OK)
+        status = read_signed(r, "SENS.azimuth_offset", offsets_at, UPB_BEAMS, 45000000, info->azimuth_offset_udeg);
+    if (status == UPB_OK)
+        status = read_signed(r, "SENS.row_height", heights_at, UPB_ROWS, 10000000, info->row_height_um);
+    return status;
 }
 
 static upb_status read_sensor(const reader *r, const section *s, upb_model_info *info) {

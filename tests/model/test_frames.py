@@ -7,8 +7,8 @@ import pytest
 
 from upbeam.model.beams import beam_table
 from upbeam.model.frames import image_of_cloud, kitti_files, kitti_frames
-from upbeam.model.geometry import to_points
-from upbeam.model.io import CloudError, read_cloud
+from upbeam.model.geometry import recover_rings, to_points
+from upbeam.model.io import Cloud, CloudError, read_cloud
 from upbeam.model.rules import Rules
 
 RULES = Rules.for_beams(beam_table("hdl-64e").aligned())
@@ -17,8 +17,9 @@ RULES = Rules.for_beams(beam_table("hdl-64e").aligned())
 def test_a_real_frame_round_trips_through_its_image(data_dir):
     """Points of the image, put back into space, lie where the recording has them (heights of the lasers included)."""
     path = kitti_files(data_dir / "kitti" / "frames")[0]
-    cloud = read_cloud(path).points
-    image = image_of_cloud(cloud, path, RULES)
+    whole = read_cloud(path)
+    cloud = whole.points
+    image = image_of_cloud(whole, path, RULES)
     rules = RULES
     points, row, column = to_points(
         image.distance, image.intensity, rules.row_elevation_deg, rules.distance_unit_m, rules.cut_deg, rules.row_height_m
@@ -39,8 +40,20 @@ def test_every_frame_has_64_rings_and_both_row_rules(data_dir):
     assert (binned.distance > 0).mean() < (ring[0].distance > 0).mean()
 
 
+def test_ring_numbers_of_a_file_are_ranked_by_elevation(data_dir):
+    """Shuffled, and numbered from the bottom: the same image as from the order of the points."""
+    path = kitti_files(data_dir / "kitti" / "frames")[0]
+    cloud = read_cloud(path)
+    order = np.random.default_rng(0).permutation(len(cloud.points))
+    numbered = Cloud(cloud.points[order], "ply", ring=63 - recover_rings(cloud.points)[order])
+    assert np.array_equal(image_of_cloud(numbered, path, RULES).distance, image_of_cloud(cloud, path, RULES).distance)
+    few = Cloud(cloud.points[:100], "ply", ring=np.zeros(100, np.int64))
+    with pytest.raises(CloudError, match="1 rings, expected 64"):
+        image_of_cloud(few, path, RULES)
+
+
 def test_a_cropped_cloud_is_refused_with_its_name(tmp_path):
     with pytest.raises(CloudError, match=r"crop\.bin.*rings"):
-        image_of_cloud(np.ones((10, 4), np.float32) * 0.5, tmp_path / "crop.bin", RULES)
+        image_of_cloud(Cloud(np.full((10, 4), 0.5, np.float32), "bin"), tmp_path / "crop.bin", RULES)
     with pytest.raises(CloudError, match=r"no \.bin frames"):
         kitti_files(tmp_path)

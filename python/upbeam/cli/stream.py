@@ -130,7 +130,7 @@ def _recorded(source: str, model: Model, frames: int | None, quiet: bool) -> _Fe
     images = np.zeros((len(files), ROWS, model.columns), np.uint16), np.zeros((len(files), ROWS, model.columns), np.uint8)
     with progress_bar("reading frames", len(files), quiet=quiet) as advance:
         for k, path in enumerate(files):
-            image = image_of_cloud(read_cloud(path).points, path, model.rules)
+            image = image_of_cloud(read_cloud(path), path, model.rules)
             images[0][k], images[1][k] = image.distance, image.intensity
             advance()
     pictured = len(files) // 2

@@ -11,7 +11,7 @@ import typer
 from numpy.typing import NDArray
 
 from upbeam.model.frames import RowRule, image_of_cloud
-from upbeam.model.geometry import to_counts, to_points
+from upbeam.model.geometry import to_counts, to_metres, to_points
 from upbeam.model.io import CloudError, RangeArrays, read_cloud, read_npy, write_bin, write_npz, write_pcd, write_ply
 from upbeam.model.rules import BEAMS, ROWS
 from upbeam.runtime.upsampler import Model, Upsampler, generated_rows, load_model
@@ -70,7 +70,7 @@ def _read(source: Path, model: Model, rows: RowRule) -> _Frame:
         if isinstance(arrays, RangeArrays):
             return _read_image(source, arrays, model)
     cloud = read_cloud(source)
-    image = image_of_cloud(cloud.points, source, model.rules, rows=rows)
+    image = image_of_cloud(cloud, source, model.rules, rows=rows)
     return _Frame(image.distance, image.intensity, cloud.points)
 
 
@@ -111,7 +111,7 @@ def _write_image(output: Path, distance: NDArray[np.uint16], intensity: NDArray[
     mask = np.broadcast_to(generated_rows()[:, None], distance.shape) & (distance > 0)
     write_npz(
         output,
-        distance=distance.astype(np.float32) * np.float32(model.distance_unit_m),
+        distance=to_metres(distance, model.distance_unit_m),
         intensity=intensity,
         counts=distance,
         generated=mask,

@@ -159,9 +159,11 @@ static void check_invariants(const upb_model *model) {
         CHECK(net->hidden >= 1 && net->hidden <= UPB_MAX_HIDDEN);
         CHECK(net->slope >= 0 && net->slope <= 1);
         CHECK(isfinite(net->skip) && isfinite(net->offset));
+        int bounded = 1;
         for (uint32_t h = 0; h < UPB_MAX_HIDDEN; h++)
             for (int i = 0; i < UPB_UNIT_FLOATS; i++)
-                CHECK(fabsf(net->unit[h][i]) <= 1e11f);
+                bounded &= fabsf(net->unit[h][i]) <= 1e11f; /* false for NaN */
+        CHECK(bounded);
     }
     CHECK(model->info.columns >= 4 && model->info.columns <= UPB_MAX_COLUMNS);
     CHECK(model->info.min_count >= 1 && model->info.min_count <= model->info.max_count);
@@ -292,8 +294,8 @@ static const wrong_field wrong_fields[] = {
     {SENS + 316, 4, (uint32_t)-90000001, UPB_E_VALUE, "SENS.elevation[63]"},
     {SENS + 320, 4, 45000001, UPB_E_VALUE, "SENS.azimuth_offset[0]"},
     {SENS + 444, 4, (uint32_t)-45000001, UPB_E_VALUE, "SENS.azimuth_offset[31]"},
-    {SENS + 448, 4, 10000001, UPB_E_VALUE, "SENS.height[0]"},
-    {SENS + 700, 4, (uint32_t)-10000001, UPB_E_VALUE, "SENS.height[63]"},
+    {SENS + 448, 4, 10000001, UPB_E_VALUE, "SENS.row_height[0]"},
+    {SENS + 700, 4, (uint32_t)-10000001, UPB_E_VALUE, "SENS.row_height[63]"},
     {NETW, 4, 1, UPB_E_VALUE, "NETW.count"},
     {NETW + 4, 4, 0, UPB_E_VALUE, "NETW[0].hidden"},
     {NETW + 4, 4, 33, UPB_E_VALUE, "NETW[0].hidden"},
