@@ -72,5 +72,8 @@ lint: $(VENV)/.dev
 model: $(VENV)/.train
 	$(BIN)/upbeam train --recipe default --out quant/models/default.ubm --evaluate $(SHARED)/kitti/frames
 
+stubs: $(VENV)/.installed
+	$(BIN)/python -m nanobind.stubgen -m upbeam.runtime._native -o runtime/_native.pyi
+
 clean:
 	rm -rf $(VENV) build dist

@@ -69,11 +69,15 @@ class BeamTable:
             values.setflags(write=False)
             object.__setattr__(self, key, values)
         if np.any(np.diff(self.elevation_deg) >= 0) or np.any(np.abs(self.elevation_deg) > 90):
-            raise BeamTableError(f"beam table {self.name!r}: elevation_deg must fall strictly, top beam first, within +-90")
+            raise BeamTableError(
+                f"beam table {self.name!r}: elevation_deg must fall strictly, top beam first, within +-90"
+            )
         if np.any(np.abs(self.azimuth_offset_deg) >= 90):
             raise BeamTableError(f"beam table {self.name!r}: azimuth_offset_deg must lie within +-90")
         if not 1e-4 <= self.distance_unit_m <= 0.1:
-            raise BeamTableError(f"beam table {self.name!r}: distance_unit_m {self.distance_unit_m} is not in [0.0001, 0.1]")
+            raise BeamTableError(
+                f"beam table {self.name!r}: distance_unit_m {self.distance_unit_m} is not in [0.0001, 0.1]"
+            )
         if not 4 <= self.columns <= 65535:
             raise BeamTableError(f"beam table {self.name!r}: columns {self.columns} is not in [4, 65535]")
 
@@ -102,7 +106,8 @@ class BeamTable:
 
 
 def between_rows(per_beam: FloatArray) -> FloatArray:
-    """A quantity of ``n`` beams for ``2n`` output rows: row ``2k`` is beam ``k``, row ``2k+1`` half way to beam ``k+1``.
+    """A quantity of ``n`` beams for ``2n`` output rows: row ``2k`` is beam ``k``, row ``2k+1`` half way to beam
+    ``k+1``.
 
     The last row continues by half the last step: a place for a repeated or empty row.
     """
@@ -123,7 +128,7 @@ def uniform_beam_table(
         name=f"uniform-{beams}",
         elevation_deg=np.linspace(top_deg, bottom_deg, beams),
         azimuth_offset_deg=zeros,
-        firing_time_us=np.arange(beams) * (48.0 / beams),
+        firing_time_us=np.arange(beams, dtype=np.float64) * (48.0 / beams),
         vertical_offset_m=zeros,
         horizontal_offset_m=zeros,
         laser_id=np.arange(beams, dtype=np.float64),
@@ -141,7 +146,8 @@ def beam_table_names() -> list[str]:
 
 
 def beam_table(name: str | Path) -> BeamTable:
-    """A shipped table by name (``hdl-64e``, ``hdl-64e/2``: every other beam, ``hdl-32e``, ``vlp-32c``) or a YAML file."""
+    """A shipped table by name (``hdl-64e``, ``hdl-64e/2``: every other beam, ``hdl-32e``, ``vlp-32c``) or a YAML
+    file."""
     path = Path(name)
     if path.suffix in {".yaml", ".yml"}:
         try:

@@ -36,7 +36,8 @@ def evaluate(
     rules: Rules,
     on_frame: Callable[[Frame], None] = lambda frame: None,
 ) -> Evaluation:
-    """Even rows in, odd rows 1..61 judged (row 63 never is). Raises ValueError for frames of another unit or without rows."""
+    """Even rows in, odd rows 1..61 judged (row 63 never is). Raises ValueError for frames of another unit or without
+    rows."""
     names: list[str] = []
     per_frame: dict[str, list[FrameMetrics]] = {name: [] for name in methods}
     for frame in frames:

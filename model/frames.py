@@ -43,10 +43,11 @@ def kitti_files(folder: str | Path) -> list[Path]:
 def image_of_cloud(
     cloud: Cloud, where: str | Path, rules: Rules, *, columns: int | None = None, rows: RowRule = "ring"
 ) -> RangeImage:
-    """A 64-row image of a cloud by its rings (the file's own, else from the order of the points), or by the paper's elevation bins.
+    """A 64-row image of a cloud by its rings (the file's own, else from the order of the points), or by the paper's
+    elevation bins.
 
-    Of rings, distances are the lasers' own paths, as the sensor's packets would give them; of elevation bins, distances from the
-    sensor's origin, as the paper's. Raises CloudError naming ``where``.
+    Of rings, distances are the lasers' own paths, as the sensor's packets would give them; of elevation bins,
+    distances from the sensor's origin, as the paper's. Raises CloudError naming ``where``.
     """
     try:
         points = cloud.points
@@ -56,7 +57,9 @@ def image_of_cloud(
     except CloudError:
         raise
     except ValueError as error:
-        raise CloudError(where, str(error), "points", "a full 64-beam frame in laser order (or elevation rows)") from None
+        raise CloudError(
+            where, str(error), "points", "a full 64-beam frame in laser order (or elevation rows)"
+        ) from None
 
 
 def _rings(cloud: Cloud) -> IndexArray:

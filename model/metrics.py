@@ -1,7 +1,8 @@
 """How far generated points are from real ones.
 
 All metrics compare generated rows with the recorded rows they stand for, both as points at their pixel's centre (same
-elevation and azimuth on both sides), distances within the model's range limits. ``d(p, Q)`` is the distance to the nearest point of Q.
+elevation and azimuth on both sides), distances within the model's range limits. ``d(p, Q)`` is the distance to the
+nearest point of Q.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ class FrameMetrics:
 
 
 def chamfer_m2(generated: FloatArray, real: FloatArray) -> tuple[float, FloatArray]:
-    """Mean of squares, both ways added; also d(p, real) of each generated point. Points ``[N, 3]``, neither set empty."""
+    """Mean of squares, both ways added; also d(p, real) of each generated point. Points ``[N, 3]``, neither set
+    empty."""
     if len(generated) == 0 or len(real) == 0:
         raise ValueError("the Chamfer distance of an empty cloud is not defined")
     to_real = cKDTree(real).query(generated, workers=-1)[0]
@@ -62,7 +64,8 @@ def compare_rows(
     rules: Rules,
     rows: slice = GENERATED,
 ) -> FrameMetrics:
-    """Generated against real rows, counts and intensities ``[R, W]`` each: those of the model's 64 that ``rows`` names."""
+    """Generated against real rows, counts and intensities ``[R, W]`` each: those of the model's 64 that ``rows``
+    names."""
     unit = rules.distance_unit_m
     geometry = rules.row_elevation_deg[rows], unit, rules.cut_deg, rules.row_height_m[rows]
     real_valid = rules.valid(real[0])

@@ -1,6 +1,7 @@
 """The window network: 215 parameters as published, 109 once folded.
 
-A window is 2 rows x 3 columns, ordered ``[r0c-1, r0c0, r0c+1, r1c-1, r1c0, r1c+1]``. Values are metres or 8-bit intensities.
+A window is 2 rows x 3 columns, ordered ``[r0c-1, r0c0, r0c+1, r1c-1, r1c0, r1c+1]``. Values are metres or 8-bit
+intensities.
 Two pointwise convolutions and the linear part of the first dense layer are one affine map, so the dense network
 folds exactly: ``y = relu(c + skip * min + v . leaky(A . [x0..x5, min] + b))``.
 """
@@ -72,12 +73,14 @@ class FoldedNetwork:
         """Sum of |w x| over the whole graph: the scale that rounding errors are measured against."""
         x = np.abs(_with_minimum(windows))
         hidden = x @ np.abs(self.weight).T + np.abs(self.bias)
-        return hidden @ np.abs(self.output_weight) + abs(self.output_bias) + abs(self.skip) * x[..., -1]
+        terms = hidden @ np.abs(self.output_weight) + abs(self.output_bias) + abs(self.skip) * x[..., -1]
+        return np.asarray(terms)
 
 
 @dataclass(frozen=True)
 class WindowNetwork:
-    """The dense graph, any widths. Float64 arrays; defaults of ``slope``, ``inputs``, ``output`` and ``scale`` are the paper's."""
+    """The dense graph, any widths. Float64 arrays; defaults of ``slope``, ``inputs``, ``output`` and ``scale`` are
+    the paper's."""
 
     conv1_weight: FloatArray
     """[C1]"""
@@ -181,8 +184,8 @@ _LAYERS = ("conv1", "conv2", "linear_1", "linear_2")
 def from_state_dict(state: Mapping[str, Any], **graph: Any) -> WindowNetwork:
     """A network from a PyTorch ``state_dict`` of this layout, given as a mapping of arrays or CPU tensors.
 
-    Keys ``conv1``, ``conv2``, ``linear_1``, ``linear_2`` with ``.weight`` and ``.bias``; widths are read off the shapes.
-    ``graph`` sets ``slope``, ``inputs``, ``output``, ``scale`` where they are not the paper's.
+    Keys ``conv1``, ``conv2``, ``linear_1``, ``linear_2`` with ``.weight`` and ``.bias``; widths are read off the
+    shapes. ``graph`` sets ``slope``, ``inputs``, ``output``, ``scale`` where they are not the paper's.
     Raises NetworkError for missing, unexpected or misshaped tensors.
     """
     wanted = [f"{layer}.{kind}" for layer in _LAYERS for kind in ("weight", "bias")]
@@ -218,7 +221,8 @@ def from_state_dict(state: Mapping[str, Any], **graph: Any) -> WindowNetwork:
 
 
 def load_state_dict(path: str | Path, **graph: Any) -> WindowNetwork:
-    """``from_state_dict`` on a file: ``.npz``, or ``.pt``/``.pth`` where PyTorch is installed (tensors only are unpickled)."""
+    """``from_state_dict`` on a file: ``.npz``, or ``.pt``/``.pth`` where PyTorch is installed (tensors only are
+    unpickled)."""
     path = Path(path)
     try:
         if path.suffix == ".npz":
@@ -228,7 +232,7 @@ def load_state_dict(path: str | Path, **graph: Any) -> WindowNetwork:
             return from_state_dict(_torch_load(path), **graph)
     except NetworkError as error:
         raise NetworkError(f"{path}: {error}") from None
-    except Exception as error:  # noqa: BLE001 - whatever the reader of an untrusted file raises, the user gets one line
+    except Exception as error:
         raise NetworkError(f"{path}: cannot be read as weights: {' '.join(str(error).split())[:200]}") from None
     raise NetworkError(f"{path}: unknown kind of weights {path.suffix!r}, expected .npz, .pt or .pth")
 

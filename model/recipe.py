@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, TypeVar
 
 import yaml
 
@@ -106,7 +106,9 @@ def _recipe(raw: Any, where: str) -> Recipe:
     networks = _mapping(top.get("networks"), f"{where}: networks")
     training = dict(_mapping(top.get("training"), f"{where}: training"))
     if set(networks) != {"distance", "intensity"}:
-        raise RecipeError(f"{where}: networks must be distance and intensity, got {', '.join(map(str, networks)) or 'none'}")
+        raise RecipeError(
+            f"{where}: networks must be distance and intensity, got {', '.join(map(str, networks)) or 'none'}"
+        )
     for key in ("distance_loss", "intensity_loss"):
         training[key] = _build(Loss, training.get(key), f"{where}: training.{key}")
     data = top.get("data")
@@ -126,8 +128,10 @@ def _network(raw: Any, where: str) -> NetworkRecipe:
     network = _build(NetworkRecipe, raw, where)
     widths = tuple(network.widths)
     if len(widths) != 3 or not all(isinstance(w, int) and 1 <= w <= 64 for w in widths):
-        raise RecipeError(f"{where}.widths must be three whole numbers of 1 to 64 (conv1, conv2, hidden), got {list(widths)}")
-    return NetworkRecipe(cast("tuple[int, int, int]", widths), network.slope, network.inputs, network.output, network.scale)
+        raise RecipeError(
+            f"{where}.widths must be three whole numbers of 1 to 64 (conv1, conv2, hidden), got {list(widths)}"
+        )
+    return NetworkRecipe(widths, network.slope, network.inputs, network.output, network.scale)
 
 
 def _positive(recipe: Recipe, where: str) -> None:

@@ -6,7 +6,7 @@ Every implementation obeys the same rules; ``docs/model-format.md`` states them 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,7 @@ U16 = NDArray[np.uint16]
 U8 = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+T = TypeVar("T", bound=np.generic)
 
 
 class RulesError(ValueError):
@@ -44,7 +45,8 @@ class Rules:
     azimuth_offset_deg: FloatArray
     """[32] of the input beams, clockwise from the firing's azimuth."""
     row_height_m: FloatArray
-    """[64] height of each output row's laser origin over the sensor's; of a generated row, what makes its points fit."""
+    """[64] height of each output row's laser origin over the sensor's; of a generated row, what makes its points
+    fit."""
     min_count: int
     max_count: int
     cut_deg: float = 180.0
@@ -61,12 +63,18 @@ class Rules:
         if np.any(np.diff(self.row_elevation_deg) >= 0):
             raise RulesError("row_elevation_deg must fall strictly, top row first")
         if not 1 <= self.min_count <= self.max_count <= 65535:
-            raise RulesError(f"range limits {self.min_count}..{self.max_count} counts, expected 1 <= min <= max <= 65535")
+            raise RulesError(
+                f"range limits {self.min_count}..{self.max_count} counts, expected 1 <= min <= max <= 65535"
+            )
         if not 4 <= self.columns <= 65535:
             raise RulesError(f"columns {self.columns}, expected 4 to 65535")
         if not 0 <= self.cut_deg < 360:
             raise RulesError(f"cut_deg {self.cut_deg}, expected 0 to 360")
-        for name, allowed in (("edge", ("zero", "seam")), ("last_row", ("repeat", "empty")), ("empty", ("none", "fill"))):
+        for name, allowed in (
+            ("edge", ("zero", "seam")),
+            ("last_row", ("repeat", "empty")),
+            ("empty", ("none", "fill")),
+        ):
             if getattr(self, name) not in allowed:
                 raise RulesError(f"{name} {getattr(self, name)!r}, expected {' or '.join(allowed)}")
 
@@ -82,7 +90,8 @@ class Rules:
         last_row: Literal["repeat", "empty"] = "empty",
         empty: Literal["none", "fill"] = "fill",
     ) -> Rules:
-        """Rules for a 32-beam table (generated rows half way between beams) or a 64-beam one (every other beam is input)."""
+        """Rules for a 32-beam table (generated rows half way between beams) or a 64-beam one (every other beam is
+        input)."""
         if beams.beams not in (BEAMS, ROWS):
             raise RulesError(f"beam table {beams.name!r} has {beams.beams} beams, expected {BEAMS} or {ROWS}")
         native = beams.beams == BEAMS
@@ -133,20 +142,20 @@ def extract_windows(distance: U16, intensity: U8, rules: Rules, *, wrap: bool = 
     d = np.where(valid, distance, 0).astype(np.float64)
     i = np.where(valid, intensity, 0).astype(np.float64)
     any_return = _neighbours(valid, wrap)
-    present = (any_return[:-1] | any_return[1:]).any(axis=-1)
+    present = np.any(any_return[:-1] | any_return[1:], axis=-1)
     if rules.empty == "none":
         return Windows(_pair(_neighbours(d, wrap)), _pair(_neighbours(i, wrap)), present)
     return Windows(_fill(d, valid, wrap), _fill(i, valid, wrap), present)
 
 
-def _neighbours(image: NDArray[np.generic], wrap: bool) -> NDArray[np.generic]:
+def _neighbours(image: NDArray[T], wrap: bool) -> NDArray[T]:
     """[rows, W] -> [rows, W, 3]: left, middle, right."""
     edges = (image[:, -1:], image[:, :1]) if wrap else (np.zeros_like(image[:, :1]),) * 2
     padded = np.concatenate([edges[0], image, edges[1]], axis=1)
     return np.stack([padded[:, :-2], padded[:, 1:-1], padded[:, 2:]], axis=-1)
 
 
-def _pair(x: NDArray[np.generic]) -> FloatArray:
+def _pair(x: NDArray[T]) -> FloatArray:
     """[rows, W, 3] -> [rows - 1, W, 6]."""
     return np.concatenate([x[:-1], x[1:]], axis=-1).astype(np.float64)
 
@@ -158,9 +167,9 @@ def _fill(x: FloatArray, valid: BoolArray, wrap: bool) -> FloatArray:
     return np.concatenate([_fill_columns(top, seen), _fill_columns(bottom, seen)], axis=-1)
 
 
-def _fill_columns(x: NDArray[np.generic], seen: NDArray[np.generic]) -> FloatArray:
-    left, middle, right = (x[..., k].astype(np.float64) for k in range(3))
-    has_left, has_middle, has_right = (seen[..., k].astype(bool) for k in range(3))
+def _fill_columns(x: FloatArray, seen: BoolArray) -> FloatArray:
+    left, middle, right = (x[..., k] for k in range(3))
+    has_left, has_middle, has_right = (seen[..., k] for k in range(3))
     between = np.where(has_left & has_right, np.minimum(left, right), np.where(has_left, left, right))
     return np.stack(
         [
@@ -173,7 +182,12 @@ def _fill_columns(x: NDArray[np.generic], seen: NDArray[np.generic]) -> FloatArr
 
 
 def upsample_reference(
-    distance: ArrayLike, intensity: ArrayLike, networks: tuple[FoldedNetwork, FoldedNetwork], rules: Rules, *, wrap: bool = False
+    distance: ArrayLike,
+    intensity: ArrayLike,
+    networks: tuple[FoldedNetwork, FoldedNetwork],
+    rules: Rules,
+    *,
+    wrap: bool = False,
 ) -> tuple[U16, U8]:
     """Counts and intensities ``[32, W]`` -> ``[64, W]``, in float64: what every other implementation is compared with.
 
@@ -182,7 +196,9 @@ def upsample_reference(
     d = np.asarray(distance, dtype=np.uint16)
     i = np.asarray(intensity, dtype=np.uint8)
     if d.ndim != 2 or d.shape[0] < 2 or i.shape != d.shape:
-        raise RulesError(f"distance {list(d.shape)} and intensity {list(i.shape)} must be equal shapes [beams, columns]")
+        raise RulesError(
+            f"distance {list(d.shape)} and intensity {list(i.shape)} must be equal shapes [beams, columns]"
+        )
     windows = extract_windows(d, i, rules, wrap=wrap)
     unit = rules.distance_unit_m
     generated = generated_counts(networks[0](windows.distance * unit) / unit, windows, rules)
@@ -199,7 +215,7 @@ def generated_counts(y_counts: FloatArray, windows: Windows, rules: Rules) -> U1
     return np.where(keep, rounded, 0).astype(np.uint16)
 
 
-def _interleave(rows: NDArray[np.generic], generated: NDArray[np.generic], rules: Rules) -> NDArray[np.generic]:
+def _interleave(rows: NDArray[T], generated: NDArray[T], rules: Rules) -> NDArray[T]:
     out = np.zeros((2 * rows.shape[0], rows.shape[1]), dtype=rows.dtype)
     out[0::2] = rows
     out[1:-1:2] = generated

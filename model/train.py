@@ -47,7 +47,7 @@ class TorchWindowNetwork(nn.Module):
         y = self.linear_2(hidden)[:, 0]
         if self.recipe.output == "residual":
             y = y + minimum[:, 0]
-        return y / self.recipe.scale
+        return torch.as_tensor(y / self.recipe.scale)
 
     def export(self) -> WindowNetwork:
         """The trained weights as arrays."""
@@ -75,7 +75,8 @@ class TrainingResult:
 
 
 def collect_samples(frames: Iterable[Frame], rules: Rules, count: int, expected_frames: int, seed: int) -> Samples:
-    """Draws about ``count`` windows evenly from ``expected_frames`` frames; only windows whose target is a valid return."""
+    """Draws about ``count`` windows evenly from ``expected_frames`` frames; only windows whose target is a valid
+    return."""
     per_frame = math.ceil(count / expected_frames)
     rng = np.random.default_rng(seed)
     parts: list[Samples] = []
@@ -102,7 +103,9 @@ def collect_samples(frames: Iterable[Frame], rules: Rules, count: int, expected_
     )
 
 
-def train_networks(recipe: Recipe, samples: Samples, rules: Rules, progress: Progress = lambda *_: None) -> TrainingResult:
+def train_networks(
+    recipe: Recipe, samples: Samples, rules: Rules, progress: Progress = lambda *_: None
+) -> TrainingResult:
     """Distance, then intensity."""
     unit = rules.distance_unit_m
     losses: dict[str, list[tuple[int, float]]] = {}
@@ -115,7 +118,13 @@ def train_networks(recipe: Recipe, samples: Samples, rules: Rules, progress: Pro
             recipe, "distance", samples.distance, samples.distance_target, unit, recipe.training.distance_loss, progress
         )
         intensity, losses["intensity"] = _fit(
-            recipe, "intensity", samples.intensity, samples.intensity_target, 1.0, recipe.training.intensity_loss, progress
+            recipe,
+            "intensity",
+            samples.intensity,
+            samples.intensity_target,
+            1.0,
+            recipe.training.intensity_loss,
+            progress,
         )
     finally:
         torch.set_num_threads(threads)
@@ -148,7 +157,7 @@ def _fit(
             x = x[:, [2, 1, 0, 5, 4, 3]]
         value = _loss(network(x) - y, loss)
         optimiser.zero_grad()
-        value.backward()
+        value.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
         running, since = running + float(value.detach()), since + 1

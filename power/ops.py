@@ -1,6 +1,7 @@
 """Operations and memory of a window network, per layer, per image and per frame.
 
-Counted from the layer widths, for the dense graph (as trained) and the folded one (as executed). A multiply-accumulate (MAC) is one
+Counted from the layer widths, for the dense graph (as trained) and the folded one (as executed). A
+multiply-accumulate (MAC) is one
 multiplication and one addition; a layer's bias is the addition that its first product needs, so both counts are equal.
 """
 
@@ -19,8 +20,8 @@ NETWORKS = 2
 """Distance and intensity."""
 
 PAPER_MEMORY_NOTE = (
-    "The paper states 2.36 MB: 1.52 MB of window inputs plus 0.84, but 0.84 is the 860 bytes of weights in KiB, added as if they "
-    "were MB. The real sum is 1.525 MB, and a streaming implementation never materialises the windows."
+    "The paper states 2.36 MB: 1.52 MB of window inputs plus 0.84, but 0.84 is the 860 bytes of weights in KiB, "
+    "added as if they were MB. The real sum is 1.525 MB, and a streaming implementation never materialises the windows."
 )
 
 

@@ -1,7 +1,7 @@
 """Pictures of runs and of range images, as PNG bytes.
 
-They are readable on paper and without colour: what is measured and what is generated differ in lightness, misses have a shape of
-their own, and near is bright.
+They are readable on paper and without colour: what is measured and what is generated differ in lightness, misses have
+a shape of their own, and near is bright.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ GENERATED = "#e8710a"
 GRID = "#d9d9d9"
 NO_RETURN = "#9aa0a6"
 _NEAR_M, _FAR_M = 3.0, 80.0
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.5,
     "axes.titlesize": 10.5,
@@ -80,7 +80,10 @@ def _styled(draw: Callable[P, Figure]) -> Callable[P, bytes]:
 
 @_styled
 def plot_latency_histogram(latencies_ms: Sequence[float], deadline_ms: float, label: str = "measured") -> Figure:
-    """How often each latency occurred, both axes logarithmic, up to the deadline. ``label``: measured, simulated or modelled."""
+    """How often each latency occurred, both axes logarithmic, up to the deadline.
+
+    ``label``: measured, simulated or modelled.
+    """
     values = np.maximum(np.asarray(latencies_ms, dtype=np.float64), 1e-4)
     figure = _figure(2.9)
     axes = figure.add_subplot()
@@ -88,7 +91,7 @@ def plot_latency_histogram(latencies_ms: Sequence[float], deadline_ms: float, la
     high = max(deadline_ms * 1.6, values.max() * 1.2 if values.size else 0.0)
     if values.size:
         axes.hist(values, bins=list(np.geomspace(low, high, 90)), color="#4c78a8", edgecolor="#1f3a57", linewidth=0.4)
-        _mark_quantiles(axes, values)
+        _mark_quantiles(axes, values, high)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(0.7, max(10.0, values.size * 1.6))
@@ -124,11 +127,11 @@ def _mark(axes: Axes, x: float, text: str, style: str, side: str = "right", heig
     )
 
 
-def _mark_quantiles(axes: Axes, values: FloatArray) -> None:
+def _mark_quantiles(axes: Axes, values: FloatArray, high: float) -> None:
     ranked = np.sort(values)
     p50, p99 = (float(ranked[-(-n * len(ranked) // 100) - 1]) for n in (50, 99))
     _mark(axes, p50, f"p50 {p50:.3g} ms", ":", side="right", height=0.97)
-    _mark(axes, p99, f"p99 {p99:.3g} ms", "--", side="left", height=0.97 if p99 < ranked[-1] * 20 else 0.82)
+    _mark(axes, p99, f"p99 {p99:.3g} ms", "--", side="left" if p99 < high / 10 else "right", height=0.8)
 
 
 @_styled
@@ -155,14 +158,14 @@ def plot_timeline(
     upper.set_ylabel("latency (ms)")
     upper.set_title(f"Frame by frame ({label})")
     if ledger:
-        upper.legend(loc="upper left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=8.5, framealpha=0.9)
+        upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, fontsize=8.5, frameon=False)
     _draw_stalls(lower, stalls)
     lower.set_xlabel("time since the start of the run (s)")
     return figure
 
 
 def _draw_verdicts(axes: Axes, ledger: Sequence[dict[str, Any]]) -> None:
-    styles = {
+    styles: dict[str, dict[str, Any]] = {
         "met": {"marker": ".", "color": "#4c78a8", "label": "met"},
         "missed": {"marker": "X", "color": "#c0201f", "markersize": 8, "label": "missed"},
         "partial": {"marker": "s", "color": "#555555", "fillstyle": "none", "label": "partial, not judged"},
@@ -263,16 +266,16 @@ def plot_birds_eye(
     reach_m: float = 40.0,
     close_up: tuple[float, float, float] | None = None,
 ) -> Figure:
-    """The cloud from above, ahead is up. ``measured``, ``generated``: ``[N, 3 or more]``, x ahead, y left, z up, metres.
+    """The cloud from above, ahead up. ``measured``, ``generated``: ``[N, 3 or more]``, x ahead, y left, z up, metres.
 
-    Left: all within ``reach_m``. Right: a square ``(x, y, half side)`` of it; without one, where most points stand above the ground.
+    Left: all within ``reach_m``. Right: a square ``(x, y, half side)`` of it; without one, where most points stand
+    above the ground.
     """
     x, y, half = close_up if close_up is not None else _busiest_square(measured, reach_m)
     figure = _figure(5.6)
     wide, near = figure.subplots(1, 2)
     for axes, size in ((wide, 0.25), (near, 3.0)):
-        axes.scatter(-measured[:, 1], measured[:, 0], s=size, color=MEASURED, linewidths=0, label="measured")
-        axes.scatter(-generated[:, 1], generated[:, 0], s=size, color=GENERATED, linewidths=0, label="generated")
+        _scatter(axes, measured, generated, size)
         axes.set_aspect("equal")
         axes.set_xlabel("to the right (m)")
         axes.grid(color=GRID, linewidth=0.5)
@@ -286,16 +289,29 @@ def plot_birds_eye(
     near.set_xlim(-y - half, -y + half)
     near.set_ylim(x - half, x + half)
     near.set_title("The square, closer")
-    near.legend(loc="upper right", markerscale=4, framealpha=0.95)
+    near.legend(loc="upper right", framealpha=0.95)
     return figure
 
 
+def _scatter(axes: Axes, measured: FloatArray, generated: FloatArray, size: float) -> None:
+    """Both kinds from above, in a random order (the same every time): where they are dense, neither hides the other."""
+    points = np.concatenate([measured[:, :2], generated[:, :2]])
+    colours = np.repeat([MEASURED, GENERATED], [len(measured), len(generated)])
+    order = np.random.default_rng(0).permutation(len(points))
+    axes.scatter(-points[order, 1], points[order, 0], s=size, c=colours[order].tolist(), linewidths=0)
+    for colour, name in ((MEASURED, "measured"), (GENERATED, "generated")):
+        axes.plot([], [], marker="o", markersize=6, linestyle="none", color=colour, label=name)
+
+
 def _busiest_square(points: FloatArray, reach_m: float, half: float = 7.0) -> tuple[float, float, float]:
-    """Middle of the square ahead that holds the most points above the ground, each weighted by its distance (near objects have more)."""
+    """Middle of the square ahead with the most points above the ground.
+
+    Each is weighted by its distance: near objects have more.
+    """
     x, y, z = (np.asarray(points[:, k], dtype=np.float64) for k in range(3))
     above = z > np.percentile(z, 20) + 0.6 if len(z) else np.zeros(0, dtype=bool)
     flat = np.hypot(x, y)
-    chosen = above & (x > 0) & (flat > 10) & (flat < min(30.0, reach_m))
+    chosen = above & (x > 0.5 * flat) & (flat > 10) & (flat < min(30.0, reach_m))
     if not chosen.any():
         return reach_m / 3, 0.0, half
     edges = np.arange(-reach_m, reach_m + 4, 4.0)

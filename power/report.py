@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from upbeam.runtime.live import quantiles_ms
 
 from .pictures import (
     Panel,
@@ -76,8 +77,9 @@ class _Row:
 def write_report(directory: str | Path, data: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> Path:
     """Writes ``report.html`` and ``report.json`` into ``directory`` (made if need be); returns the HTML's path.
 
-    ``data["live"]`` is ``LiveResult.to_dict()``. Optional: ``title`` (text), ``operations``, ``memory``, ``model``, ``source``,
-    ``environment`` (nested dicts of plain values: each becomes a table), ``notes`` (list of texts). All of it goes to the JSON.
+    ``data["live"]`` is ``LiveResult.to_dict()``. Optional: ``title`` (text), ``operations``, ``memory``, ``model``,
+    ``source``, ``environment`` (nested dicts of plain values: each becomes a table), ``notes`` (list of texts). All of
+    it goes to the JSON.
     Raises ReportError when ``live`` is absent or a value does not fit JSON; nothing is written then.
     """
     if "live" not in data:
@@ -150,30 +152,28 @@ def _kind(live: Mapping[str, Any]) -> str:
 # -------------------------------------------------------------------------------------------------------- tables
 
 
-def _row(name: str, boundary: str, kind: str, unit: str, values: Mapping[str, float]) -> _Row:
-    return _Row(name, boundary, kind, unit, *(values.get(key) for key in ("p50", "p99", "p999", "max")))
+_LATENCY = ("latency of a frame", "last input column received to last output column complete")
+_WAIT = ("of it: waiting for the sensor", "until the packet arrived that completes the last column")
+_COLUMN = ("compute, one column", "both networks, output collected")
+_PACKET = ("compute, one packet", "from taken to done")
+_LATENESS = ("lateness of the simulated sensor", "packet played after it was due")
+
+
+def _row(what: tuple[str, str], kind: str, unit: str, values: Mapping[str, float]) -> _Row:
+    return _Row(*what, kind, unit, *(values.get(key) for key in ("p50", "p99", "p999", "max")))
 
 
 def _times(live: Mapping[str, Any]) -> list[_Row]:
     kind = _kind(live)
-    waits = _quantiles([r["wait_ns"] / 1e6 for r in live["ledger"] if r["verdict"] != "partial"])
+    waits = quantiles_ms([r["wait_ns"] for r in live["ledger"] if r["verdict"] != "partial"])
     rows = [
-        _row("latency of a frame", "last input column received to last output column complete", kind, "ms", live["latency_ms"]),
-        _row("of it: waiting for the sensor", "until the packet arrived that completes the last column", kind, "ms", waits),
-        _row("compute, one column", "both networks, output collected", kind, "µs", live["column_compute_us"]),
-        _row(f"compute, one packet of {live['columns_per_packet']}", "from taken to done", kind, "µs", live["packet_compute_us"]),
+        _row(_LATENCY, kind, "ms", live["latency_ms"]),
+        _row(_WAIT, kind, "ms", waits),
+        _row(_COLUMN, kind, "µs", live["column_compute_us"]),
+        _row(_PACKET, kind, "µs", live["packet_compute_us"]),
+        _row(_LATENESS, "measured" if live["clock"] == "real" else "given", "µs", live["pacer_lateness_us"]),
     ]
-    lateness = "measured" if live["clock"] == "real" else "given"
-    rows.append(_row("lateness of the simulated sensor", "packet played after it was due", lateness, "µs", live["pacer_lateness_us"]))
     return [row for row in rows if row.most is not None]
-
-
-def _quantiles(values: Sequence[float]) -> dict[str, float]:
-    if not values:
-        return {}
-    ranked = sorted(values)
-    picked = {key: ranked[math.ceil(share * len(ranked)) - 1] for key, share in (("p50", 0.5), ("p99", 0.99), ("p999", 0.999))}
-    return picked | {"max": ranked[-1]}
 
 
 def _misses(live: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -187,23 +187,27 @@ def _accounts(counts: Mapping[str, int]) -> list[tuple[str, str]]:
     return [
         (
             f"{c['frames_begun']} frames begun",
-            f"{c['frames_met']} met + {c['frames_missed']} missed + {c['frames_partial']} partial + {c['frames_empty']} of which nothing arrived",
+            f"{c['frames_met']} met + {c['frames_missed']} missed + {c['frames_partial']} partial + "
+            f"{c['frames_empty']} of which nothing arrived",
         ),
         (
             f"{c['packets_played']} packets sent",
-            f"{c['packets_taken']} taken + {c['packets_dropped_fault']} dropped by an ordered fault + {c['packets_dropped_overflow']} by overflow",
+            f"{c['packets_taken']} taken + {c['packets_dropped_fault']} dropped by an ordered fault + "
+            f"{c['packets_dropped_overflow']} by overflow",
         ),
         (f"{c['columns_played']} columns sent", f"{c['columns_taken']} taken + {dropped} never arrived"),
     ]
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Nested dicts as rows of a table: ``cpu.name`` -> text."""
+    """Nested dicts, and lists of them, as rows of a table: ``cpu.name`` and ``layers.1.macs`` -> text."""
     rows: list[tuple[str, str]] = []
     for key, item in value.items():
         name = f"{prefix}{key}"
         if isinstance(item, Mapping):
             rows.extend(_flat(item, f"{name}."))
+        elif isinstance(item, (list, tuple)) and any(isinstance(part, Mapping) for part in item):
+            rows.extend(_flat({str(n): part for n, part in enumerate(item, 1)}, f"{name}."))
         else:
             rows.append((name.replace("_", " "), _text(item)))
     return rows
@@ -217,7 +221,7 @@ def _text(item: Any) -> str:
     if isinstance(item, float):
         return _figures(item)
     if item is None:
-        return "–"
+        return "none"
     if isinstance(item, str):
         return item
     if isinstance(item, Iterable):

@@ -1,4 +1,5 @@
-"""The ``.ubm`` model file: writer and reader. The format is ``docs/model-format.md``; the C runtime reads it on its own.
+"""The ``.ubm`` model file: writer and reader. The format is ``docs/model-format.md``; the C runtime reads it on its
+own.
 
 A ``ModelFile`` is the parsed content; ``write`` and ``read`` are each other's inverse, byte for byte.
 """
@@ -14,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
 from upbeam.model.network import FoldedNetwork, WindowNetwork
 from upbeam.model.rules import BEAMS, ROWS, Rules, RulesError
 
@@ -227,7 +227,9 @@ def _parse(data: bytes) -> ModelFile:
 
 def _sections(data: bytes) -> dict[str, bytes]:
     if len(data) < HEADER_BYTES + 4:
-        raise UbmError(f"{len(data)} bytes, a model file has at least {HEADER_BYTES + 4}: truncated, or not a .ubm file")
+        raise UbmError(
+            f"{len(data)} bytes, a model file has at least {HEADER_BYTES + 4}: truncated, or not a .ubm file"
+        )
     magic, version, header, total, count = struct.unpack_from("<4sHHII", data)
     if magic != MAGIC:
         raise UbmError(f"begins with {magic!r}, expected {MAGIC!r}: not a .ubm model file")
@@ -248,7 +250,9 @@ def _sections(data: bytes) -> dict[str, bytes]:
         raw_tag, flags, offset, size = struct.unpack_from("<4s3I", data, HEADER_BYTES + 16 * k)
         tag = raw_tag.decode("ascii", errors="replace")
         if not (tag.isascii() and tag.isprintable()) or flags & ~REQUIRED:
-            raise UbmError(f"entry {k} of the section table: tag {raw_tag!r}, flags {flags:#x}; expected 4 letters, 0 or 1")
+            raise UbmError(
+                f"entry {k} of the section table: tag {raw_tag!r}, flags {flags:#x}; expected 4 letters, 0 or 1"
+            )
         if offset % 8 or offset < free or offset + size > total - 4:
             raise UbmError(f"section {tag} at {offset} with {size} bytes lies outside the file, or overlaps")
         if tag in out:
@@ -349,7 +353,9 @@ def _parse_dens(cursor: _Cursor) -> tuple[WindowNetwork, WindowNetwork]:
         inputs, output = cursor.u32("input", 0, 1), cursor.u32("output", 0, 1)
         scale, slope = cursor.floats("scale and slope", 2)
         if not (scale > 0 and 0 <= slope <= 1):
-            raise UbmError(f"section DENS: scale {scale:g}, slope {slope:g}; expected a positive scale, a slope of 0 to 1")
+            raise UbmError(
+                f"section DENS: scale {scale:g}, slope {slope:g}; expected a positive scale, a slope of 0 to 1"
+            )
         networks.append(
             WindowNetwork(
                 conv1_weight=cursor.floats("conv1 weight", c1),

@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-
 from upbeam.model.rules import BEAMS
 
 from ._native import LiveConfig as NativeConfig
@@ -42,6 +41,7 @@ MODES = ("network",)
 _CPUS = ("auto", "scalar", "avx2", "avx512", "neon")
 _PRECISIONS = ("fp32", "int16", "int8")
 _WAITS = ("block", "poll")
+_CHOICES = {"clock": ("real", "virtual"), "precision": _PRECISIONS, "cpu": _CPUS, "wait": _WAITS}
 _POLL_S = 0.1
 _NS_PER_US = 1000
 _NS_PER_MS = 1_000_000
@@ -93,15 +93,15 @@ class LiveConfig:
     service_column_us: float | None = None
     """Virtual clock: time for each column."""
     service_us: Sequence[float] = ()
-    """Virtual clock, instead of the two constants: time for each packet, from the start again when the run is longer."""
+    """Virtual clock, instead of the two constants: time for each packet, repeated when the run is longer."""
     jitter_us: Sequence[float] = ()
-    """Virtual clock: each packet arrives this long after it is due, from the start again when the run is longer."""
+    """Virtual clock: each packet arrives this long after it is due, repeated when the run is longer."""
 
     def __post_init__(self) -> None:
         _need(math.isfinite(self.rate_hz) and 0.001 <= self.rate_hz <= 100, "rate_hz", self.rate_hz, "0.001 to 100")
         _need(self.frames is None or self.frames >= 1, "frames", self.frames, "at least 1")
         _need(math.isfinite(self.deadline_ms) and self.deadline_ms >= 1e-6, "deadline_ms", self.deadline_ms, "above 0")
-        for name, choices in (("clock", ("real", "virtual")), ("precision", _PRECISIONS), ("cpu", _CPUS), ("wait", _WAITS)):
+        for name, choices in _CHOICES.items():
             _need(getattr(self, name) in choices, name, getattr(self, name), "one of " + ", ".join(choices))
         ring = self.ring_packets
         _need(2 <= ring <= 65536 and ring & (ring - 1) == 0, "ring_packets", ring, "a power of two, 2 to 65536")
@@ -122,7 +122,7 @@ class LiveConfig:
             value = getattr(self, name)
             _need(value is None or 0 <= value <= 1e9, name, value, "0 to 1e9")
         if self.clock == "virtual" and not given and not self.service_us:
-            raise LiveConfigError("clock 'virtual' needs service times: service_us, or service_packet_us and service_column_us")
+            raise LiveConfigError("clock 'virtual' needs service times: service_us, or those of a packet and a column")
         if self.clock == "real" and (given or self.service_us or self.jitter_us):
             raise LiveConfigError("service times and jitter are for clock 'virtual' only")
         if given and self.service_us:
@@ -183,8 +183,8 @@ class LiveResult:
     counts: dict[str, int]
     """Frames, packets and columns by what became of them."""
     ledger: list[dict[str, Any]]
-    """One record a frame (see ``upb_ledger_record``), and: ``wait_ns`` (part of the latency: until the packet arrived that
-    completed the last column), ``columns_received``, ``flushed`` (the stream ended with it), ``explained``."""
+    """One record a frame (see ``upb_ledger_record``), and: ``wait_ns`` (part of the latency: until the packet arrived
+    that completed the last column), ``columns_received``, ``flushed`` (the stream ended with it), ``explained``."""
     drops: list[dict[str, Any]]
     """Packets that did not arrive: ``packet``, ``at_ns``, ``columns``, ``cause`` (``fault`` or ``overflow``)."""
     drops_unlisted: int
@@ -233,8 +233,9 @@ def run_live(
 ) -> LiveResult:
     """Plays firing columns ``[F, W, 32]`` (uint16 counts, uint8; contiguous arrays are not copied) through ``model``.
 
-    ``on_progress`` is called from the calling thread about ten times a second and once at the end. A KeyboardInterrupt ends the run: what
-    was done until then is returned, with ``stopped`` set. Raises LiveConfigError for settings or arrays that do not fit.
+    ``on_progress`` is called from the calling thread about ten times a second and once at the end. A KeyboardInterrupt
+    ends the run: what was done until then is returned, with ``stopped`` set. Raises LiveConfigError for settings or
+    arrays that do not fit.
     """
     config = config or LiveConfig()
     distance, intensity = _check_frames(model, frames_distance, frames_intensity, config)
@@ -256,12 +257,12 @@ def run_live(
 def explained_by_stalls(
     stalls: Sequence[tuple[int, int]], last_input_ns: int, output_ns: int, deadline_ms: float
 ) -> bool:
-    """Whether a frame would have met its deadline without the time inside stalls (start, duration; ns; sorted by start)."""
+    """Whether a frame would have met its deadline without the time inside ``stalls`` (start and duration, by start)."""
     return live_explains(list(stalls), last_input_ns, output_ns, round(deadline_ms * _NS_PER_MS))
 
 
 def quantiles_ms(latencies_ns: Sequence[int]) -> dict[str, float]:
-    """Exact quantiles (nearest rank: a latency that occurred), maximum and mean in milliseconds; empty without latencies."""
+    """Exact quantiles (nearest rank: a latency that occurred), maximum and mean in ms; empty without latencies."""
     if not latencies_ns:
         return {}
     ranked = sorted(latencies_ns)
@@ -286,11 +287,11 @@ def _check_frames(model: Model, distance: U16, intensity: U8, config: LiveConfig
         list(distance.shape),
         f"[frames, columns, {BEAMS}]",
     )
-    _need(intensity.shape == distance.shape, "shape of frames_intensity", list(intensity.shape), f"{list(distance.shape)}")
-    columns = distance.shape[1]
-    _need(
-        config.any_sensor or columns == model.columns, "columns of a frame", columns, f"the model's {model.columns}"
-    )
+    shape = list(distance.shape)
+    _need(intensity.shape == distance.shape, "shape of frames_intensity", list(intensity.shape), f"{shape}")
+    columns = shape[1]
+    fits = config.any_sensor or columns == model.columns
+    _need(fits, "columns of a frame", columns, f"the model's {model.columns}")
     _need(config.columns_per_packet <= columns, "columns_per_packet", config.columns_per_packet, f"at most {columns}")
     return np.ascontiguousarray(distance), np.ascontiguousarray(intensity)
 
@@ -324,24 +325,30 @@ def _native_config(config: LiveConfig, total: int) -> NativeConfig:
 def _run_watched(native: NativeRun, total: int, on_progress: Callable[[LiveProgress], None] | None) -> None:
     """Runs on a thread of its own, so that this one sees signals and reports progress."""
     failures: list[Exception] = []
+    done = threading.Event()
 
     def run() -> None:
         try:
             native.run()
         except Exception as error:
             failures.append(error)
+        finally:
+            done.set()
 
     thread = threading.Thread(target=run, name="upbeam-live", daemon=True)
     thread.start()
     try:
-        while thread.is_alive():
-            thread.join(_POLL_S)
+        # Not by joining: an interrupted Thread.join can take a running thread for a finished one.
+        finished = False
+        while not finished:
+            finished = done.wait(_POLL_S)
             if on_progress is not None:
                 on_progress(_progress(native, total))
     except KeyboardInterrupt:
         pass  # the result says that the run was stopped
     finally:
         native.stop()
+        done.wait()
         thread.join()
     if failures:
         raise failures[0]

@@ -9,7 +9,6 @@ from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
-
 from upbeam.model.geometry import to_counts, to_metres
 from upbeam.model.rules import BEAMS, ROWS, Rules
 from upbeam.quant.ubm import ModelFile, UbmError, read_ubm
@@ -76,7 +75,7 @@ def load_model(path: str | Path | None = None) -> Model:
 
 def generated_rows() -> NDArray[np.bool_]:
     """``[64]``: True for the output rows that no laser measured."""
-    return np.arange(ROWS) % 2 == 1
+    return np.asarray(np.arange(ROWS) % 2 == 1)
 
 
 @dataclass(frozen=True)
@@ -105,9 +104,16 @@ class Upsampler:
     """
 
     def __init__(
-        self, model: Model, precision: str = "fp32", backend: str = "cpu", *, columns: int | None = None, cpu: str = "auto"
+        self,
+        model: Model,
+        precision: str = "fp32",
+        backend: str = "cpu",
+        *,
+        columns: int | None = None,
+        cpu: str = "auto",
     ) -> None:
-        """``columns``: width of the images where it is not the model's. ``cpu``: force ``scalar``, ``avx2``, ``avx512``, ``neon``."""
+        """``columns``: width of the images where it is not the model's. ``cpu``: force ``scalar``, ``avx2``,
+        ``avx512``, ``neon``."""
         if precision not in PRECISIONS:
             raise ValueError(f"precision {precision!r} is not available, expected one of: {', '.join(PRECISIONS)}")
         if backend not in BACKENDS:
@@ -133,8 +139,10 @@ class Upsampler:
     def __call__(self, distance: Any, intensity: Any) -> tuple[Any, U8]:
         """``[32, W]`` azimuth-aligned distances and intensities (uint8) -> both as ``[64, W]``.
 
-        Distances are uint16 counts (``model.distance_unit_m`` each) or float32 metres; the result has the same type. Even rows are
-        the input's, to the bit. Raises ValueError for other types and shapes, and for metres that are NaN, infinite or negative.
+        Distances are uint16 counts (``model.distance_unit_m`` each) or float32 metres; the result has the same type.
+        Even rows are
+        the input's, to the bit. Raises ValueError for other types and shapes, and for metres that are NaN, infinite
+        or negative.
         """
         d, i = np.asarray(distance), np.asarray(intensity)
         self._check(d, i)
@@ -173,7 +181,8 @@ class ColumnStream:
         )
 
     def push(self, distance: U16, intensity: U8, column: int) -> Columns:
-        """Firing columns ``[n, 32]`` (uint16 counts, uint8), the first at place ``column`` of the turn. Late ones are dropped and
+        """Firing columns ``[n, 32]`` (uint16 counts, uint8), the first at place ``column`` of the turn. Late ones
+        are dropped and
         counted in ``stats``; places that were skipped come out as columns without a return."""
         if distance.dtype != np.uint16 or intensity.dtype != np.uint8:
             raise ValueError(f"columns are {distance.dtype} and {intensity.dtype}, expected uint16 and uint8")

@@ -15,7 +15,7 @@ static inline void store_u8(uint8_t *p, __m256 v) {
 #define V __m256
 #define M __m256
 #define V_LANES 8
-#define V_BLOCK 2
+#define V_BLOCK 4
 #define V_LOAD(p) _mm256_load_ps(p)
 #define V_LOADU(p) _mm256_loadu_ps(p)
 #define V_STORE(p, v) _mm256_store_ps(p, v)

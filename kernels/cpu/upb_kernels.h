@@ -1,8 +1,9 @@
 /*
  * Window kernels on the CPU: internal interface between the column stream and one C file per instruction set.
  *
- * A column of 32 beams has 31 windows; window k lies between beams k and k+1. Windows are the lanes of the vectors: lane k
- * of every array below is window k. Lane 31 is padding: it holds finite values of no meaning, and nobody reads its result.
+ * A column of 32 beams has 31 windows; window k lies between beams k and k+1. Windows are the lanes of the vectors:
+ * lane k of every array below is window k. Lane 31 is padding: it holds finite values of no meaning, and nobody reads
+ * its result.
  *
  * All distances are in counts (the sensor's units), all intensities in their 8-bit steps; the size of a count is folded
  * into the weights when the model is loaded. So is the step from the file's pixels to differences from the window
@@ -23,9 +24,9 @@
 enum { UPB_UNIT_BIAS = UPB_TAPS, UPB_UNIT_OUTPUT = UPB_TAPS + 1, UPB_UNIT_FLOATS = 16 };
 
 /*
- * One network, folded: y = offset + sum over h of OUTPUT[h] * leaky(BIAS[h] + sum over i of unit[h][i] * x[i]) + skip * min,
- * in this order. One hidden unit is one cache line: seven weights, bias, output weight, zeros.
- * Values: finite, magnitudes below 1e11; slope 0..1. Inputs are at most 65535, so that no sum overflows.
+ * One network, folded: y = offset + sum over h of OUTPUT[h] * leaky(BIAS[h] + sum over i of unit[h][i] * x[i]) + skip *
+ * min, in this order. One hidden unit is one cache line: seven weights, bias, output weight, zeros. Values: finite,
+ * magnitudes below 1e11; slope 0..1. Inputs are at most 65535, so that no sum overflows.
  */
 typedef struct upb_network_f32 {
     _Alignas(UPB_ALIGN) float unit[UPB_MAX_HIDDEN][UPB_UNIT_FLOATS];
@@ -63,14 +64,16 @@ typedef void (*upb_prepare_f32_fn)(upb_prepared_f32 *prepared, const upb_model_f
                                    const uint8_t *intensity);
 
 /*
- * Both networks on the 31 windows around `middle`. Writes UPB_LANES values to both outputs (no alignment needed): distance
- * 0 or min_count..max_count, intensity 0..255 and 0 where the distance is 0. The three columns may be one and the same.
+ * Both networks on the 31 windows around `middle`. Writes UPB_LANES values to both outputs (no alignment needed):
+ * distance 0 or min_count..max_count, intensity 0..255 and 0 where the distance is 0. The three columns may be one and
+ * the same.
  */
 typedef void (*upb_windows_f32_fn)(const upb_model_f32 *model, const upb_prepared_f32 *left,
                                    const upb_prepared_f32 *middle, const upb_prepared_f32 *right, uint16_t *distance,
                                    uint8_t *intensity);
 
-/* For tests: the networks' outputs before rounding, limits and the all-empty rule; [UPB_LANES] each, no alignment needed. */
+/* For tests: the networks' outputs before rounding, limits and the all-empty rule; [UPB_LANES] each, no alignment
+ * needed. */
 typedef void (*upb_raw_f32_fn)(const upb_model_f32 *model, const upb_prepared_f32 *left, const upb_prepared_f32 *middle,
                                const upb_prepared_f32 *right, float *distance, float *intensity);
 
@@ -81,8 +84,8 @@ typedef struct upb_kernels {
 } upb_kernels;
 
 /*
- * Fills `kernels` with those of one instruction set, UPB_CPU_AUTO: the fastest. Returns the upb_cpu chosen, or UPB_CPU_AUTO
- * if this machine or this build does not have the one asked for (`kernels` is then untouched).
+ * Fills `kernels` with those of one instruction set, UPB_CPU_AUTO: the fastest. Returns the upb_cpu chosen, or
+ * UPB_CPU_AUTO if this machine or this build does not have the one asked for (`kernels` is then untouched).
  */
 upb_cpu upb_kernels_select(upb_kernels *kernels, upb_cpu cpu);
 

@@ -1,8 +1,8 @@
 """upbeam turns a 32-beam LiDAR into a 64-beam one on embedded hardware.
 
-    model = upbeam.load_model()
-    up = upbeam.Upsampler(model)
-    distance64, intensity64 = up(distance32, intensity32)
+model = upbeam.load_model()
+up = upbeam.Upsampler(model)
+distance64, intensity64 = up(distance32, intensity32)
 """
 
 from importlib.metadata import version as _version

@@ -2,9 +2,7 @@
 
 #include <string.h>
 
-static void show(_Atomic uint64_t *shown, uint64_t value) {
-    atomic_store_explicit(shown, value, memory_order_relaxed);
-}
+static void show(_Atomic uint64_t *shown, uint64_t value) { atomic_store_explicit(shown, value, memory_order_relaxed); }
 
 /* ---------------------------------------------------------------------------------------------- output images */
 

@@ -1,6 +1,8 @@
 #include "live_pacer.h"
 
-#define SLEEP_AT_MOST_NS 20000000u /* to see *stop */
+#include <string.h>
+
+#define SLEEP_AT_MOST_NS 20000000u   /* to see *stop */
 #define NS_PER_1000_S 1000000000000u /* a turn at one millihertz */
 
 uint64_t live_pacer_due_ns(const live_pacer *pacer, uint64_t column) {
@@ -10,34 +12,44 @@ uint64_t live_pacer_due_ns(const live_pacer *pacer, uint64_t column) {
     const uint64_t rest = column % columns;
 
     /* From whole turns and a rest: the product over all columns would overflow after an hour, and a sum drift. */
-    return pacer->config->lead_ns + turns * NS_PER_1000_S / rate +
-           rest * NS_PER_1000_S / (rate * columns);
+    return pacer->config->lead_ns + turns * NS_PER_1000_S / rate + rest * NS_PER_1000_S / (rate * columns);
 }
 
 static uint64_t played_packets(const live_pacer *pacer) {
     return atomic_load_explicit(&pacer->shown_packets, memory_order_relaxed);
 }
 
-/* A packet does not reach over the end of the arrays: its columns lie side by side there. */
+/* The arrays' last column is followed by their first one again. */
+static void wrap_columns(live_pacer *pacer, live_packet *packet, uint64_t at, uint64_t before_end) {
+    const upb_live_config *config = pacer->config;
+    const size_t head = (size_t)before_end * UPB_BEAMS;
+    const size_t tail = (size_t)(packet->columns - before_end) * UPB_BEAMS;
+
+    memcpy(pacer->wrapped_distance, config->distance + at * UPB_BEAMS, head * sizeof *config->distance);
+    memcpy(pacer->wrapped_distance + head, config->distance, tail * sizeof *config->distance);
+    memcpy(pacer->wrapped_intensity, config->intensity + at * UPB_BEAMS, head);
+    memcpy(pacer->wrapped_intensity + head, config->intensity, tail);
+    packet->distance = pacer->wrapped_distance;
+    packet->intensity = pacer->wrapped_intensity;
+}
+
 int live_pacer_next(live_pacer *pacer, live_packet *packet) {
     const upb_live_config *config = pacer->config;
     const uint64_t in_arrays = (uint64_t)config->frames * config->columns;
     const uint64_t at = pacer->next_column % in_arrays;
-    uint64_t columns = config->columns_per_packet;
+    const uint64_t left = pacer->columns_total - pacer->next_column;
 
-    if (pacer->next_column >= pacer->columns_total)
+    if (left == 0)
         return 0;
-    if (columns > pacer->columns_total - pacer->next_column)
-        columns = pacer->columns_total - pacer->next_column;
-    if (columns > in_arrays - at)
-        columns = in_arrays - at;
     packet->sequence = played_packets(pacer);
     packet->first_column = pacer->next_column;
     packet->received_ns = 0;
-    packet->columns = (uint32_t)columns;
+    packet->columns = left < config->columns_per_packet ? (uint32_t)left : config->columns_per_packet;
     packet->distance = config->distance + at * UPB_BEAMS;
     packet->intensity = config->intensity + at * UPB_BEAMS;
-    pacer->next_column += columns;
+    if (packet->columns > in_arrays - at)
+        wrap_columns(pacer, packet, at, in_arrays - at);
+    pacer->next_column += packet->columns;
     return 1;
 }
 
@@ -47,10 +59,8 @@ static void note_drop(live_pacer *pacer, const live_packet *packet, upb_live_cau
         pacer->drops_unlisted++;
         return;
     }
-    pacer->drops[pacer->drop_count++] = (upb_live_drop){.packet = packet->sequence,
-                                                       .at_ns = packet->received_ns,
-                                                       .columns = packet->columns,
-                                                       .cause = (uint32_t)cause};
+    pacer->drops[pacer->drop_count++] = (upb_live_drop){
+        .packet = packet->sequence, .at_ns = packet->received_ns, .columns = packet->columns, .cause = (uint32_t)cause};
 }
 
 int live_pacer_drops(live_pacer *pacer, const live_packet *packet) {

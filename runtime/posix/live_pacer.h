@@ -13,7 +13,9 @@ typedef struct live_pacer {
     live_clock *clock;
     uint64_t columns_total; /* to play */
     uint64_t next_column;
-    size_t drop_next; /* drop_packets before it have passed */
+    size_t drop_next;           /* drop_packets before it have passed */
+    uint16_t *wrapped_distance; /* [columns_per_packet][UPB_BEAMS]: a packet that reaches over the arrays' end */
+    uint8_t *wrapped_intensity;
 
     upb_histogram lateness;
     uint64_t columns_played;
@@ -29,7 +31,7 @@ typedef struct live_pacer {
 /* When the column of that number since the start of the run is due. */
 uint64_t live_pacer_due_ns(const live_pacer *pacer, uint64_t column);
 
-/* The next packet, with the columns where the caller of the run keeps them. 0 when all have been played. */
+/* The next packet; its columns lie in the caller's arrays where possible. 0 when all have been played. */
 int live_pacer_next(live_pacer *pacer, live_packet *packet);
 
 /* True if a fault was ordered for this packet; it is then counted. Packets must be asked for in their order. */

@@ -38,9 +38,9 @@ struct upb_live {
     sem_t packets; /* posted for each packet put in, and at the end */
     uint32_t has_semaphore;
     uint32_t was_run;
-    _Atomic int stop;         /* asked for */
-    _Atomic int pacer_ended;  /* no packet follows */
-    _Atomic int witness_end;  /* witnesses may go */
+    _Atomic int stop;        /* asked for */
+    _Atomic int pacer_ended; /* no packet follows */
+    _Atomic int witness_end; /* witnesses may go */
     uint32_t pacer_realtime, consumer_realtime, memory_locked;
     uint64_t pacer_cpu_ns, consumer_cpu_ns;
     uint64_t duration_ns;
@@ -182,6 +182,12 @@ static int make_witnesses(upb_live *live) {
 }
 
 static int make_lists(upb_live *live) {
+    const size_t packet_pixels = (size_t)live->config.columns_per_packet * UPB_BEAMS;
+
+    live->pacer.wrapped_distance = calloc(packet_pixels, sizeof *live->pacer.wrapped_distance);
+    live->pacer.wrapped_intensity = calloc(packet_pixels, sizeof *live->pacer.wrapped_intensity);
+    if (live->pacer.wrapped_distance == NULL || live->pacer.wrapped_intensity == NULL)
+        return 0;
     live->consumer.frame_capacity = (size_t)live->consumer.frames_total;
     live->consumer.frames = calloc(live->consumer.frame_capacity, sizeof *live->consumer.frames);
     live->pacer.drop_capacity = MAX_LISTED_DROPS;
@@ -256,6 +262,8 @@ void upb_live_destroy(upb_live *live) {
     free(live->stalls);
     free(live->consumer.frames);
     free(live->pacer.drops);
+    free(live->pacer.wrapped_distance);
+    free(live->pacer.wrapped_intensity);
     free(live->slot_free_ns);
     free(live);
 }

@@ -2,11 +2,12 @@
  * A stream in real time: plays recorded or simulated frames at a sensor's pace, upsamples them and judges every frame.
  *
  * Three kinds of threads. The pacer plays the sensor: packet by packet, each at its due time. The consumer takes the
- * packets from a ring, as from a socket, and pushes their columns into a upb_stream. One witness a core sleeps in short steps
- * and notes when it was woken late, so that a stall of the machine is told apart from one of ours.
+ * packets from a ring, as from a socket, and pushes their columns into a upb_stream. One witness a core sleeps in short
+ * steps and notes when it was woken late, so that a stall of the machine is told apart from one of ours.
  *
- * This library is not part of libupbeam: it has threads, and memory from the heap (taken by upb_live_create alone, given
- * back by upb_live_destroy). With a virtual clock the same consumer and ledger run on one thread and give the same bits every time.
+ * This library is not part of libupbeam: it has threads, and memory from the heap (taken by upb_live_create alone,
+ * given back by upb_live_destroy). With a virtual clock the same consumer and ledger run on one thread and give the
+ * same bits every time.
  *
  * Times are nanoseconds since the start of the run: CLOCK_MONOTONIC, or the virtual clock.
  *
@@ -38,7 +39,10 @@ typedef enum upb_live_status {
 /* One lower-case English sentence without full stop, static, never null. */
 const char *upb_live_status_text(upb_live_status status);
 
-/* How the consumer waits for the next packet. */
+/*
+ * How the consumer waits for the next packet. Blocking is the default: on a busy two-core virtual machine, at 20 Hz x
+ * 2048, it had the lowest p99 of the latency, at 2 % of a core; polling every 20 us took 40 %, every 100 us 12 %.
+ */
 typedef enum upb_live_wait {
     UPB_LIVE_WAIT_BLOCK = 0, /* on a semaphore: woken by the pacer */
     UPB_LIVE_WAIT_POLL = 1   /* looks every poll_ns; 0: never sleeps, and burns a core */
@@ -88,7 +92,7 @@ typedef struct upb_live_config {
 /* 20 Hz, 12 columns a packet, 50 ms, a ring of 256 packets, a witness a core; frames and columns must be filled in. */
 upb_live_config upb_live_config_default(void);
 
-#define UPB_LIVE_FLUSHED 1u   /* the stream ended with this frame: no later packet completed it, a flush did */
+#define UPB_LIVE_FLUSHED 1u   /* the stream ended with this frame: a flush completed it, not a later packet */
 #define UPB_LIVE_EXPLAINED 2u /* missed, and met without the machine's stalls (upb_live_explains) */
 
 /* A frame of the ledger, and what the runner knows beyond it. */
@@ -119,7 +123,7 @@ typedef struct upb_live_drop {
 /* An output image, column-major as it is produced. Columns that were not produced are 0. */
 typedef struct upb_live_image {
     uint64_t frame;
-    uint32_t columns_out;     /* columns produced, 0 if the run ended before */
+    uint32_t columns_out; /* columns produced, 0 if the run ended before */
     uint32_t reserved;
     const uint16_t *distance; /* [columns][UPB_ROWS] */
     const uint8_t *intensity; /* [columns][UPB_ROWS] */
@@ -182,7 +186,8 @@ upb_live_status upb_live_create(const upb_model *model, const upb_live_config *c
                                 upb_error *error);
 /* Runs to the end, or until upb_live_stop; once. The caller's thread waits (with a virtual clock: works). */
 upb_live_status upb_live_run(upb_live *live);
-/* Ends the run early: what has arrived is finished, an unfinished frame is PARTIAL. From any thread or signal handler. */
+/* Ends the run early: what has arrived is finished, an unfinished frame is PARTIAL. From any thread or signal handler.
+ */
 void upb_live_stop(upb_live *live);
 /* From any thread, without holding up the run. The values may be of slightly different moments. */
 upb_live_progress upb_live_get_progress(const upb_live *live);

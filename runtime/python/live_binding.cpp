@@ -24,8 +24,10 @@ using IntensityFrames = nb::ndarray<const uint8_t, nb::shape<-1, -1, UPB_BEAMS>,
 using Numbers = std::vector<uint64_t>;
 
 void check_live(upb_live_status status, const upb_error &error) {
-    if (status == UPB_LIVE_OK) return;
-    if (status == UPB_LIVE_E_LIBRARY) check(error.status, &error);
+    if (status == UPB_LIVE_OK)
+        return;
+    if (status == UPB_LIVE_E_LIBRARY)
+        check(error.status, &error);
     std::string text = upb_live_status_text(status);
     if (status == UPB_LIVE_E_ARGUMENT)
         text = std::string(error.what) + ": " + text + " (got " + std::to_string(error.got) + ", limit " +
@@ -95,12 +97,13 @@ nb::tuple image_tuple(const upb_live_image &image, size_t columns) {
 
 template <typename T, typename F> nb::list list_of(const T *items, size_t count, F &&convert) {
     nb::list list;
-    for (size_t i = 0; i < count; ++i) list.append(convert(items[i]));
+    for (size_t i = 0; i < count; ++i)
+        list.append(convert(items[i]));
     return list;
 }
 
 class LiveRun {
-public:
+  public:
     LiveRun(const ModelHandle &model, DistanceFrames distance, IntensityFrames intensity, const upb_live_config &config,
             Numbers drop_packets, Numbers keep_frames, Numbers service_ns, Numbers jitter_ns)
         : distance_(std::move(distance)), intensity_(std::move(intensity)), drop_packets_(std::move(drop_packets)),
@@ -176,7 +179,7 @@ public:
         return d;
     }
 
-private:
+  private:
     static nb::dict counts(const upb_live_result &r) {
         nb::dict d;
         d["frames_begun"] = r.frames_begun;
@@ -211,7 +214,8 @@ private:
 bool explains(const std::vector<std::pair<uint64_t, uint64_t>> &stalls, uint64_t from_ns, uint64_t to_ns,
               uint64_t deadline_ns) {
     std::vector<upb_live_stall> list;
-    for (const auto &[start, duration] : stalls) list.push_back({start, duration, 0, 0});
+    for (const auto &[start, duration] : stalls)
+        list.push_back({start, duration, 0, 0});
     return upb_live_explains(list.data(), list.size(), from_ns, to_ns, deadline_ns) != 0;
 }
 
@@ -255,14 +259,14 @@ void bind_config(nb::module_ &m) {
 void bind_live(nb::module_ &m) {
     bind_config(m);
     nb::class_<LiveRun>(m, "LiveRun", "One run of the real-time runner.")
-        .def(nb::init<const ModelHandle &, DistanceFrames, IntensityFrames, const upb_live_config &, Numbers, Numbers, Numbers,
-                      Numbers>(),
+        .def(nb::init<const ModelHandle &, DistanceFrames, IntensityFrames, const upb_live_config &, Numbers, Numbers,
+                      Numbers, Numbers>(),
              "model"_a, "distance"_a, "intensity"_a, "config"_a, "drop_packets"_a, "keep_frames"_a, "service_ns"_a,
              "jitter_ns"_a, nb::keep_alive<1, 2>())
         .def("run", &LiveRun::run)
         .def("stop", &LiveRun::stop)
-        .def("progress", &LiveRun::progress)
-        .def("result", &LiveRun::result);
+        .def("progress", &LiveRun::progress, nb::sig("def progress(self) -> dict[str, int]"))
+        .def("result", &LiveRun::result, nb::sig("def result(self) -> dict[str, typing.Any]"));
     m.def("live_explains", &explains, "stalls"_a, "from_ns"_a, "to_ns"_a, "deadline_ns"_a,
           "True if the latency meets the deadline without the stalls, (start, duration) sorted by start.");
 }

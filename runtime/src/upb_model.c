@@ -210,7 +210,8 @@ static upb_status read_signed(const reader *r, const char *what, size_t at, unsi
     for (unsigned i = 0; i < count; i++) {
         const int64_t value = values[i] = i32_at(r, at + 4 * i);
         if (value < -limit || value > limit)
-            return bad_element(r, what, i, at + 4 * i, (uint64_t)value, (uint64_t)(int64_t)(value < 0 ? -limit : limit));
+            return bad_element(r, what, i, at + 4 * i, (uint64_t)value,
+                               (uint64_t)(int64_t)(value < 0 ? -limit : limit));
     }
     return UPB_OK;
 }
@@ -300,8 +301,8 @@ static upb_status read_network(const reader *r, unsigned network, size_t *at, si
 }
 
 /*
- * From the file's network to the kernels' (upb_kernels.h): `unit` is the size of a count in what the file's network sees
- * and gives. A network on pixels x is one on differences x - min whose weight of the minimum is the sum of all.
+ * From the file's network to the kernels' (upb_kernels.h): `unit` is the size of a count in what the file's network
+ * sees and gives. A network on pixels x is one on differences x - min whose weight of the minimum is the sum of all.
  */
 static void fold(upb_network_f32 *net, double unit) {
     for (uint32_t h = 0; h < net->hidden; h++) {
@@ -361,8 +362,7 @@ static upb_status read_file(const reader *r, upb_model *model) {
     if ((status = read_header(r, &sections, &model->info.crc32)) != UPB_OK ||
         (status = read_table(r, sections, entries)) != UPB_OK ||
         (status = find_sections(r, sections, entries, &sens, &netw)) != UPB_OK ||
-        (status = read_sensor(r, sens, &model->info)) != UPB_OK ||
-        (status = read_networks(r, netw, model)) != UPB_OK)
+        (status = read_sensor(r, sens, &model->info)) != UPB_OK || (status = read_networks(r, netw, model)) != UPB_OK)
         return status;
     for (int n = 0; n < 2; n++)
         model->info.hidden[n] = model->f32.network[n].hidden;

@@ -22,9 +22,9 @@ typedef struct ring_slot {
 
 /* How azimuth offsets become a ring. */
 typedef struct destagger {
-    int32_t shift;                /* azimuth column of firing column j: j + shift + (0 at beam_slot = delay) */
-    uint32_t slots;               /* azimuth columns that fill at the same time; 1: no ring is needed */
-    uint32_t delay;               /* firing columns from a column to its last beam */
+    int32_t shift;                 /* azimuth column of firing column j: j + shift + (0 at beam_slot = delay) */
+    uint32_t slots;                /* azimuth columns that fill at the same time; 1: no ring is needed */
+    uint32_t delay;                /* firing columns from a column to its last beam */
     uint16_t beam_slot[UPB_BEAMS]; /* slots ahead of the oldest one */
 } destagger;
 
@@ -49,17 +49,17 @@ struct upb_stream {
     destagger beams;
 
     /* firing columns of this segment */
-    uint32_t started;      /* a firing column was taken */
-    uint32_t last_column;  /* the last one, inserted ones included */
-    uint32_t waiting;      /* firing columns still to come before the segment's first azimuth column is complete */
-    uint32_t oldest;       /* ring slot of the next azimuth column to complete */
-    ring_slot *ring;       /* beams.slots, none if that is 1 */
+    uint32_t started;     /* a firing column was taken */
+    uint32_t last_column; /* the last one, inserted ones included */
+    uint32_t waiting;     /* firing columns still to come before the segment's first azimuth column is complete */
+    uint32_t oldest;      /* ring slot of the next azimuth column to complete */
+    ring_slot *ring;      /* beams.slots, none if that is 1 */
 
     /* azimuth columns of this segment */
-    place next;            /* the next one to complete */
-    uint32_t spare;        /* prepared[] that the next one goes to */
+    place next;     /* the next one to complete */
+    uint32_t spare; /* prepared[] that the next one goes to */
     const upb_prepared_f32 *left, *middle;
-    uint32_t pending;      /* `middle` waits for its right neighbour; its own rows lie in out_* already */
+    uint32_t pending; /* `middle` waits for its right neighbour; its own rows lie in out_* already */
     uint32_t pending_flags;
     place pending_place;
 };
@@ -261,7 +261,8 @@ static void keep_pending(upb_stream *s, const upb_prepared_f32 *prepared, const 
     s->middle = prepared;
     s->pending = 1;
     s->pending_place = s->next;
-    s->pending_flags = (complete ? 0 : UPB_COLUMN_INCOMPLETE) | (s->next.column + 1 == s->columns ? UPB_COLUMN_LAST : 0);
+    s->pending_flags =
+        (complete ? 0 : UPB_COLUMN_INCOMPLETE) | (s->next.column + 1 == s->columns ? UPB_COLUMN_LAST : 0);
 }
 
 /* Takes the next azimuth column of the segment. */
@@ -321,7 +322,8 @@ static void take_firing_column(upb_stream *s, const uint16_t *distance, const ui
             scatter(s, distance, intensity);
         complete_slot(s);
     } else {
-        take_azimuth_column(s, distance ? distance : no_distance, distance ? intensity : no_intensity, distance != NULL);
+        take_azimuth_column(s, distance ? distance : no_distance, distance ? intensity : no_intensity,
+                            distance != NULL);
     }
 }
 
@@ -366,7 +368,8 @@ upb_status upb_stream_flush(upb_stream *stream) {
         return UPB_E_ARGUMENT;
     if (!stream->started)
         return UPB_OK;
-    /* Columns up to the last firing column's; those beyond it, begun by beams that look ahead, are outside the stream. */
+    /* Columns up to the last firing column's; those beyond it, begun by beams that look ahead, are outside the stream.
+     */
     for (uint32_t i = 0; i < stream->beams.delay; i++)
         complete_slot(stream);
     if (stream->pending)

@@ -1,12 +1,12 @@
 /*
- * Every window kernel of this machine against the plain C one, on random and extreme columns; with --bench the very same
- * calls are timed. Options: --seed N, --rounds N (models to check), --model FILE.ubm (a trained one), --bench.
+ * Every window kernel of this machine against the plain C one, on random and extreme columns; with --bench the very
+ * same calls are timed. Options: --seed N, --rounds N (models to check), --model FILE.ubm (a trained one), --bench.
  *
  * What may differ: fused products round once where plain C rounds twice. So raw outputs agree within 1e-5 of the sum of
- * the magnitudes that they are made of, and a count may flip where the output lies that near a threshold. With a trained
- * model on scenes (smooth surfaces) the outputs agree within SCENE_TOLERANCE counts and at most 300 windows of a million
- * flip (130 measured: a count flips with twice the probability of the error, 6e-5 counts). The vector kernels agree with
- * one another to the bit.
+ * the magnitudes that they are made of, and a count may flip where the output lies that near a threshold. With a
+ * trained model on scenes (smooth surfaces) the outputs agree within SCENE_TOLERANCE counts and at most 300 windows of
+ * a million flip (130 measured: a count flips with twice the probability of the error, 6e-5 counts). The vector kernels
+ * agree with one another to the bit.
  */
 #define _POSIX_C_SOURCE 199309L
 #include <math.h>
@@ -47,7 +47,8 @@ static struct {
 
 /* ------------------------------------------------------------------------------------------------ inputs */
 
-static void random_network(random_source *random, upb_network_f32 *net, uint32_t hidden, float in_unit, float out_unit) {
+static void random_network(random_source *random, upb_network_f32 *net, uint32_t hidden, float in_unit,
+                           float out_unit) {
     memset(net, 0, sizeof *net);
     net->hidden = hidden;
     net->positive = random_below(random, 2);
@@ -66,7 +67,8 @@ static void random_network(random_source *random, upb_network_f32 *net, uint32_t
 static void random_model_f32(random_source *random, upb_model_f32 *model, uint32_t hidden, int is_wild) {
     const float wild = is_wild ? 1e9f : 1.0f;
     random_network(random, &model->network[UPB_DISTANCE], hidden, 0.002f, 500.0f * wild);
-    random_network(random, &model->network[UPB_INTENSITY], 1 + random_below(random, UPB_MAX_HIDDEN), 0.05f, 20.0f * wild);
+    random_network(random, &model->network[UPB_INTENSITY], 1 + random_below(random, UPB_MAX_HIDDEN), 0.05f,
+                   20.0f * wild);
     const uint32_t low = 1 + random_below(random, 3000), high = low + random_below(random, 65536 - low);
     model->min_count = (float)low;
     model->max_count = (float)high;
@@ -83,7 +85,8 @@ static uint16_t pattern_distance(random_source *random, unsigned pattern, const 
     const uint16_t within = (uint16_t)(low + random_below(random, high - low + 1));
     switch (pattern) {
     case SCENE: /* smooth surfaces some steps apart, a return in ten missing */
-        return random_below(random, 10) ? (uint16_t)(low + (high - low) / 2 + 40 * (k / 8) + random_below(random, 20)) : 0;
+        return random_below(random, 10) ? (uint16_t)(low + (high - low) / 2 + 40 * (k / 8) + random_below(random, 20))
+                                        : 0;
     case 1:
         return within;
     case 2:
@@ -109,7 +112,9 @@ static void pattern_column(random_source *random, unsigned pattern, const upb_mo
     const unsigned chosen = random_u32(random);
     for (unsigned k = 0; k < UPB_BEAMS; k++) {
         column->distance[k] = pattern_distance(random, pattern, model, k, chosen);
-        column->intensity[k] = (uint8_t)(pattern == ALL_MAX ? 255 : pattern == ALL_EQUAL ? chosen >> 8 : random_below(random, 256));
+        column->intensity[k] = (uint8_t)(pattern == ALL_MAX     ? 255
+                                         : pattern == ALL_EQUAL ? chosen >> 8
+                                                                : random_below(random, 256));
     }
 }
 
@@ -315,7 +320,58 @@ static double time_image(const upb_kernels *kernels, const upb_model_f32 *model,
     return seconds_now() - start;
 }
 
-static void bench(upb_cpu cpu, random_source *random) {
+static void report(const char *cpu_name, const char *what, double *seconds) {
+    qsort(seconds, BENCH_RUNS, sizeof seconds[0], compare_doubles);
+    const double least = seconds[0], median = seconds[BENCH_RUNS / 2];
+    printf("%-7s %-7s %8.1f %8.1f ns per column, %7.3f %7.3f ms per image of %d columns (min, median; measured)\n",
+           cpu_name, what, least / BENCH_COLUMNS * 1e9, median / BENCH_COLUMNS * 1e9, least * 1e3, median * 1e3,
+           BENCH_COLUMNS);
+}
+
+static uint32_t column_sum;
+
+static void use_column(void *user, const upb_column *column) {
+    (void)user;
+    column_sum += column->distance[1];
+}
+
+/* The whole step of a stream: destagger ring, both networks, interleaving, sink; and the same as whole frames. */
+static void bench_stream(upb_cpu cpu, const upb_model *model, const raw_column *columns) {
+    static _Alignas(UPB_ALIGN) unsigned char memory[1 << 18];
+    static uint16_t in_d[UPB_BEAMS][BENCH_COLUMNS], out_d[UPB_ROWS][BENCH_COLUMNS];
+    static uint8_t in_i[UPB_BEAMS][BENCH_COLUMNS], out_i[UPB_ROWS][BENCH_COLUMNS];
+    double pushed[BENCH_RUNS], framed[BENCH_RUNS];
+    uint32_t written;
+    upb_stream *stream;
+    upb_stream_config config = upb_stream_config_default();
+    config.cpu = cpu;
+    config.columns = BENCH_COLUMNS;
+    config.any_sensor = 1;
+    config.sink = use_column;
+    if (!CHECK(upb_stream_init(memory, sizeof memory, model, &config, &stream, NULL) == UPB_OK))
+        return;
+    for (unsigned c = 0; c < BENCH_COLUMNS; c++)
+        for (unsigned k = 0; k < UPB_BEAMS; k++)
+            in_d[k][c] = columns[c].distance[k], in_i[k][c] = columns[c].intensity[k];
+    for (unsigned i = 0; i < BENCH_RUNS; i++) {
+        double start = seconds_now();
+        for (unsigned c = 0; c < BENCH_COLUMNS; c++)
+            upb_stream_push(stream, c, columns[c].distance, columns[c].intensity);
+        pushed[i] = seconds_now() - start;
+        start = seconds_now();
+        upb_stream_frame(stream, in_d[0], BENCH_COLUMNS, in_i[0], BENCH_COLUMNS, out_d[0], BENCH_COLUMNS, out_i[0],
+                         BENCH_COLUMNS, BENCH_COLUMNS, &written);
+        framed[i] = seconds_now() - start;
+    }
+    upb_stream_stats stats;
+    upb_stream_get_stats(stream, &stats);
+    CHECK(stats.columns_late == 0 && stats.columns_missing == 0 && written == BENCH_COLUMNS);
+    report(cpu_names[cpu], "push", pushed);
+    report(cpu_names[cpu], "frame", framed);
+}
+
+/* With a trained model if there is one, else with a random one of BENCH_HIDDEN units. */
+static void bench(upb_cpu cpu, const upb_model *trained, random_source *random) {
     static raw_column columns[BENCH_COLUMNS];
     static upb_model_f32 model;
     double seconds[BENCH_RUNS];
@@ -325,18 +381,18 @@ static void bench(upb_cpu cpu, random_source *random) {
     random_model_f32(random, &model, BENCH_HIDDEN, 0);
     model.network[UPB_INTENSITY].hidden = BENCH_HIDDEN;
     model.fill = 1;
+    if (trained)
+        model = trained->f32;
     for (unsigned c = 0; c < BENCH_COLUMNS; c++)
         pattern_column(random, c % 2, &model, &columns[c]);
     for (unsigned i = 0; i < BENCH_RUNS; i++)
         seconds[i] = time_image(&kernels, &model, columns);
-    qsort(seconds, BENCH_RUNS, sizeof seconds[0], compare_doubles);
-    const double least = seconds[0], median = seconds[BENCH_RUNS / 2];
-    printf("%-8s %9.1f %9.1f ns per column, %8.3f %8.3f ms per image of %d columns (min, median; measured)\n",
-           cpu_names[cpu], least / BENCH_COLUMNS * 1e9, median / BENCH_COLUMNS * 1e9, least * 1e3, median * 1e3,
-           BENCH_COLUMNS);
+    report(cpu_names[cpu], "kernel", seconds);
+    if (trained)
+        bench_stream(cpu, trained, columns);
 }
 
-static const upb_model_f32 *load(const char *path) {
+static const upb_model *load(const char *path) {
     static _Alignas(UPB_ALIGN) unsigned char memory[UPB_MODEL_BYTES_MAX];
     static unsigned char file[1 << 20];
     upb_model *model;
@@ -349,13 +405,14 @@ static const upb_model_f32 *load(const char *path) {
         fprintf(stderr, "%s: %s (%s)\n", path, upb_status_text(error.status), error.what);
         exit(2);
     }
-    return &model->f32;
+    return model;
 }
 
 int main(int argc, char **argv) {
     parameters p = {.seed = option_number(argc, argv, "--seed", (unsigned long)time(NULL))};
     const unsigned rounds = (unsigned)option_number(argc, argv, "--rounds", 2 * UPB_MAX_HIDDEN);
     const char *path = option_text(argc, argv, "--model");
+    const upb_model *model = path ? load(path) : NULL;
     random_source random = random_seeded(p.seed);
     printf("checkkernels --seed %lu --rounds %u\n", p.seed, rounds);
     for (int cpu = UPB_CPU_SCALAR; cpu <= UPB_CPU_NEON; cpu++) {
@@ -367,13 +424,13 @@ int main(int argc, char **argv) {
         }
         check_by_hand(&kernels);
         if (option_given(argc, argv, "--bench"))
-            bench((upb_cpu)cpu, &random);
+            bench((upb_cpu)cpu, model, &random);
     }
     for (p.round = 0; p.round < rounds; p.round++)
         check_round(&p, &random);
     printf("%llu windows compared, %llu flips at thresholds\n", all.windows, all.flips);
-    if (path)
-        check_scenes(&p, &random, load(path));
+    if (model)
+        check_scenes(&p, &random, &model->f32);
     else
         printf("no --model: scenes not compared\n");
     return check_report("checkkernels");

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from upbeam.model.beams import beam_table
 from upbeam.model.frames import image_of_cloud, kitti_files, kitti_frames
 from upbeam.model.geometry import recover_rings, to_points
@@ -22,14 +21,21 @@ def test_a_real_frame_round_trips_through_its_image(data_dir):
     image = image_of_cloud(whole, path, RULES)
     rules = RULES
     points, row, column = to_points(
-        image.distance, image.intensity, rules.row_elevation_deg, rules.distance_unit_m, rules.cut_deg, rules.row_height_m
+        image.distance,
+        image.intensity,
+        rules.row_elevation_deg,
+        rules.distance_unit_m,
+        rules.cut_deg,
+        rules.row_height_m,
     )
     original = cloud[image.index[row, column]]
     steps = np.floor(original[:, 3].astype(np.float64) * 255 + 0.5)
     assert np.array_equal(steps, np.floor(points[:, 3] * np.float64(255) + 0.5))
     error = np.linalg.norm(points[:, :3] - original[:, :3], axis=1)
     near = np.linalg.norm(original[:, :3], axis=1) < 20
-    print(f"median {1e3 * np.median(error[near]):.0f} mm, 99 %: {1e3 * np.quantile(error[near], 0.99):.0f} mm within 20 m")
+    print(
+        f"median {1e3 * np.median(error[near]):.0f} mm, 99 %: {1e3 * np.quantile(error[near], 0.99):.0f} mm within 20 m"
+    )
     assert np.median(error[near]) < 0.06
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from upbeam.model.network import NetworkError, WindowNetwork, from_state_dict, load_state_dict
 
 VECTORS = Path(__file__).parents[1] / "vectors" / "window_network.npz"
@@ -71,7 +70,9 @@ def test_flattening_is_channel_major_and_the_window_is_rows_first():
     """One hot weights: hidden unit reads channel 1 of pixel r1c-1 alone."""
     linear = np.zeros((1, 13))
     linear[0, 6 + 3] = 1.0
-    network = WindowNetwork(np.ones(1), np.zeros(1), np.array([[0.0], [10.0]]), np.zeros(2), linear, np.zeros(1), np.ones(1), 0.0)
+    network = WindowNetwork(
+        np.ones(1), np.zeros(1), np.array([[0.0], [10.0]]), np.zeros(2), linear, np.zeros(1), np.ones(1), 0.0
+    )
     assert network(np.array([1, 2, 3, 4, 5, 6])) == pytest.approx(40.0)
     assert network.fold()(np.array([1, 2, 3, 4, 5, 6])) == pytest.approx(40.0)
 
@@ -80,7 +81,9 @@ def test_leaky_and_final_rectifier():
     def unit(weight, output):
         linear = np.zeros((1, 7))
         linear[0, 0] = weight
-        return WindowNetwork(np.ones(1), np.zeros(1), np.ones((1, 1)), np.zeros(1), linear, np.zeros(1), np.array([output]), 0.0)
+        return WindowNetwork(
+            np.ones(1), np.zeros(1), np.ones((1, 1)), np.zeros(1), linear, np.zeros(1), np.array([output]), 0.0
+        )
 
     window = np.array([5.0, 1, 1, 1, 1, 1])
     assert unit(-2.0, -1.0)(window) == pytest.approx(0.1)  # -10 -> -0.1 (slope 0.01) -> 0.1

@@ -1,10 +1,10 @@
-"""Window extraction, empty-pixel rule, edges, limits and the last row against a pixel-by-pixel reading of the documentation."""
+"""Window extraction, empty-pixel rule, edges, limits and the last row against a pixel-by-pixel reading of the
+documentation."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from upbeam.model.beams import beam_table, uniform_beam_table
 from upbeam.model.network import FoldedNetwork
 from upbeam.model.rules import BEAMS, Rules, RulesError, extract_windows, upsample_reference
@@ -101,7 +101,9 @@ def test_rounding_limits_and_the_all_empty_window(rng):
 @pytest.mark.parametrize(("rule", "expected"), [("repeat", "row 62"), ("empty", "nothing")])
 def test_last_row(rng, rule, expected):
     distance, intensity = random_image(rng)
-    out, grey = upsample_reference(distance, intensity, (constant_network(9.0), constant_network(1.0)), make_rules(last_row=rule))
+    out, grey = upsample_reference(
+        distance, intensity, (constant_network(9.0), constant_network(1.0)), make_rules(last_row=rule)
+    )
     assert np.array_equal(out[63], distance[31] if expected == "row 62" else np.zeros(16))
     assert np.array_equal(grey[63], intensity[31] if expected == "row 62" else np.zeros(16))
 
@@ -118,7 +120,12 @@ def test_rules_of_beam_tables():
 
 @pytest.mark.parametrize(
     ("changes", "named"),
-    [({"columns": 3}, "columns"), ({"min_m": 90.0}, "range limits"), ({"edge": "wrap"}, "edge"), ({"empty": "mean"}, "empty")],
+    [
+        ({"columns": 3}, "columns"),
+        ({"min_m": 90.0}, "range limits"),
+        ({"edge": "wrap"}, "edge"),
+        ({"empty": "mean"}, "empty"),
+    ],
 )
 def test_impossible_rules_are_refused_by_name(changes, named):
     with pytest.raises(RulesError, match=named):

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 import upbeam
 from upbeam.hw_sim import simulate_frames
 from upbeam.model.baselines import BASELINES
@@ -143,7 +142,8 @@ def _state(torch, dense):
     return {
         "conv1.weight": tensor(dense.conv1_weight, c1, 1, 1), "conv1.bias": tensor(dense.conv1_bias, c1),
         "conv2.weight": tensor(dense.conv2_weight, c2, c1, 1), "conv2.bias": tensor(dense.conv2_bias, c2),
-        "linear_1.weight": tensor(dense.linear_1_weight, h, 6 * c2 + 1), "linear_1.bias": tensor(dense.linear_1_bias, h),
+        "linear_1.weight": tensor(dense.linear_1_weight, h, 6 * c2 + 1),
+        "linear_1.bias": tensor(dense.linear_1_bias, h),
         "linear_2.weight": tensor(dense.linear_2_weight, 1, h), "linear_2.bias": tensor(dense.linear_2_bias, 1),
     }  # fmt: skip
 

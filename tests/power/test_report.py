@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from upbeam.power.report import (
     Panel,
     Picture,
@@ -130,7 +129,7 @@ def test_html_needs_nothing_else(tmp_path: Path) -> None:
 def test_page_tells_what_happened(tmp_path: Path) -> None:
     page, html = _write(
         tmp_path,
-        operations={"macs_per_frame_executed": 12189696},
+        operations={"macs_per_frame_executed": 12189696, "layers": [{"name": "conv1"}, {"name": "linear_2"}]},
         environment={"cpu": {"name": "a <fast> one", "flags": ["avx2", "fma"]}, "threads": None},
         notes=["Other work ran on the machine."],
     )
@@ -142,6 +141,8 @@ def test_page_tells_what_happened(tmp_path: Path) -> None:
         "40948 taken + 12 never arrived",
         "12\u202f189\u202f696",
         "cpu.name",
+        "layers.2.name",
+        "linear_2",
         "a <fast> one",
         "avx2, fma",
         "Other work ran on the machine.",

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 import upbeam
 from upbeam.model.beams import beam_table
-from upbeam.model.geometry import to_metres
 from upbeam.model.frames import kitti_frames
+from upbeam.model.geometry import to_metres
 from upbeam.model.network import WindowNetwork
 from upbeam.model.rules import Rules, extract_windows, upsample_reference
 from upbeam.quant import ModelFile
@@ -59,11 +58,19 @@ def extremes(columns=256):
     single = np.zeros((32, columns), np.uint16)
     single[7, columns // 2] = 5000
     checker = np.where(alternating > 0, 40_000, 1500).astype(np.uint16)
-    images = [np.zeros((32, columns), np.uint16), np.full((32, columns), 65535, np.uint16), alternating, single, checker]
+    images = [
+        np.zeros((32, columns), np.uint16),
+        np.full((32, columns), 65535, np.uint16),
+        alternating,
+        single,
+        checker,
+    ]
     return [(image, grey) for image in images]
 
 
-@pytest.mark.parametrize("rules", [{"empty": "fill"}, {"empty": "none", "edge": "zero", "last_row": "repeat", "raw": True}])
+@pytest.mark.parametrize(
+    "rules", [{"empty": "fill"}, {"empty": "none", "edge": "zero", "last_row": "repeat", "raw": True}]
+)
 @pytest.mark.parametrize("cpu", USABLE)
 def test_images_match_the_reference(rng, cpu, rules):
     """Within one count (float32 against float64 at a rounding boundary); validity differs only at a threshold."""
@@ -108,7 +115,13 @@ def stream_image(model, distance, intensity, chunks, **options):
     parts, at = [], 0
     for n in chunks:
         part = slice(at, at + n)
-        parts.append(stream.push(np.ascontiguousarray(distance[:, part].T), np.ascontiguousarray(intensity[:, part].T), at % model.columns))
+        parts.append(
+            stream.push(
+                np.ascontiguousarray(distance[:, part].T),
+                np.ascontiguousarray(intensity[:, part].T),
+                at % model.columns,
+            )
+        )
         at += n
     parts.append(stream.flush())
     return np.concatenate([p.distance for p in parts]).T, np.concatenate([p.intensity for p in parts]).T, stream.stats()
@@ -210,7 +223,11 @@ def test_generated_rows_are_named():
 @pytest.mark.parametrize(
     ("distance", "intensity", "named"),
     [
-        (np.zeros((32, 255), np.uint16), np.zeros((32, 256), np.uint8), r"distance has shape \[32, 255\], expected \[32, 256\]"),
+        (
+            np.zeros((32, 255), np.uint16),
+            np.zeros((32, 256), np.uint8),
+            r"distance has shape \[32, 255\], expected \[32, 256\]",
+        ),
         (np.zeros((32, 256), np.uint16), np.zeros((31, 256), np.uint8), r"intensity has shape \[31, 256\]"),
         (np.zeros((32, 256), np.int32), np.zeros((32, 256), np.uint8), "distance is int32"),
         (np.zeros((32, 256), np.uint16), np.zeros((32, 256), np.float32), "intensity is float32"),

@@ -1,6 +1,8 @@
-"""Makes window_network.npz: what PyTorch computes for window networks, in float64. Needs PyTorch; run it from any folder.
+"""Makes window_network.npz: what PyTorch computes for window networks, in float64. Needs PyTorch; run it from any
+folder.
 
-The main tests compare with the stored values, so that they need no PyTorch; ``make test-train`` checks that this script still gives them.
+The main tests compare with the stored values, so that they need no PyTorch; ``make test-train`` checks that this
+script still gives them.
 """
 
 from __future__ import annotations

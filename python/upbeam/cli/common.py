@@ -19,7 +19,9 @@ __all__ = ["JsonOption", "UserError", "emit_json", "message", "progress_bar", "s
 out = Console()
 err = Console(stderr=True)
 
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on standard output, messages on standard error.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="One JSON object on standard output, messages on standard error.")
+]
 
 
 class UserError(ValueError):
@@ -42,7 +44,9 @@ def show(renderable: Any) -> None:
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     """A table: first column left, others right."""
-    result = Table(title=title, title_justify="left", title_style="bold", header_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    result = Table(
+        title=title, title_justify="left", title_style="bold", header_style="bold", box=box.SIMPLE_HEAD, pad_edge=False
+    )
     for k, column in enumerate(columns):
         result.add_column(column, justify="left" if k == 0 else "right", no_wrap=k == 0)
     for row in rows:
@@ -52,7 +56,8 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
 
 @contextmanager
 def progress_bar(what: str, total: int, *, quiet: bool = False) -> Iterator[Any]:
-    """Yields ``advance(n=1, note="")``. On standard error; silent where that is not a terminal, but for a closing line."""
+    """Yields ``advance(n=1, note="")``. On standard error; silent where that is not a terminal, but for a closing
+    line."""
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         TimeRemainingColumn(), TextColumn("{task.fields[note]}"),

@@ -47,7 +47,8 @@ def evaluate(
     else:
         show(evaluation_table(result, f"{source}: {len(result.frames)} frames, {rows} rows, generated rows only"))
         message(
-            "measured on these frames. x: ratio to valid-mean. Chamfer: m2, mean of squares, both ways; MAE: metres, where a return exists; grey: intensity MAE, 8-bit steps; "
+            "measured on these frames. x: ratio to valid-mean. Chamfer: m2, mean of squares, both ways; "
+            "MAE: metres, where a return exists; grey: intensity MAE, 8-bit steps; "
             "ghosts: generated points over 0.5 m from any real one; cover: real returns that got a point."
         )
 
@@ -68,13 +69,13 @@ def model_method(model: Model) -> Method:
     return run
 
 
-def _frames(
-    source: str, model: Model, limit: int | None, rows: Any, seed: int
-) -> tuple[Iterable[Frame], int]:
+def _frames(source: str, model: Model, limit: int | None, rows: Any, seed: int) -> tuple[Iterable[Frame], int]:
     if source == "sim":
         base = model.rules.sensor.removesuffix("/2")
         if base == model.rules.sensor:
-            raise UserError(f"the model is made for {base}: its generated rows have no simulated truth; give recorded frames")
+            raise UserError(
+                f"the model is made for {base}: its generated rows have no simulated truth; give recorded frames"
+            )
         count = limit or 20
         scans = simulated_scans(beam_table(base), columns=model.columns, frames=count, seed=seed, frames_per_scene=1)
         return map(frame_of_scan, scans), count

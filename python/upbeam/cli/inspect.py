@@ -53,7 +53,13 @@ def inspect(
     show(table("Model", ["", "value"], [[k, str(v)] for k, v in data.items() if k not in skip]))
     columns = ["", *networks]
     keys = list(networks["distance"])
-    show(table("Networks", columns, [[k, *(f"{networks[n][k]:g}" if networks[n][k] is not None else "-" for n in networks)] for k in keys]))
+    show(
+        table(
+            "Networks",
+            columns,
+            [[k, *(f"{networks[n][k]:g}" if networks[n][k] is not None else "-" for n in networks)] for k in keys],
+        )
+    )
     for name in ("provenance", "metrics"):
         if data[name]:
             show(table(name.capitalize(), ["", "value"], [[k, str(v)] for k, v in data[name].items()]))  # type: ignore[attr-defined]

@@ -16,7 +16,9 @@ __all__ = ["ops"]
 
 def ops(
     model: Annotated[str | None, typer.Option(help="A .ubm model instead of the shipped one.")] = None,
-    columns: Annotated[int | None, typer.Option(min=4, max=65535, help="Columns per turn instead of the model's.")] = None,
+    columns: Annotated[
+        int | None, typer.Option(min=4, max=65535, help="Columns per turn instead of the model's.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Count operations and memory of a model's networks."""
@@ -31,7 +33,9 @@ def ops(
 
 
 def _print(count: OperationCount) -> None:
-    rows = [[layer.graph, layer.name, f"{layer.macs}", f"{layer.parameters}"] for layer in (*count.dense, *count.folded)]
+    rows = [
+        [layer.graph, layer.name, f"{layer.macs}", f"{layer.parameters}"] for layer in (*count.dense, *count.folded)
+    ]
     show(table("One network, one window", ["graph", "layer", "MACs", "parameters"], rows))
     d = count.as_dict()
     show(
@@ -41,8 +45,16 @@ def _print(count: OperationCount) -> None:
             [
                 ["MACs per window", f"{count.macs_dense}", f"{count.macs_folded}"],
                 ["MACs per image", _m(d["macs_per_image_dense"]), _m(count.macs_folded * count.windows)],
-                ["MACs per frame (distance + intensity)", _m(d["macs_per_frame_dense"]), _m(d["macs_per_frame_executed"])],
-                ["operations per image (+ and x apart)", _m(d["operations_per_image_dense"]), _m(2 * count.macs_folded * count.windows)],
+                [
+                    "MACs per frame (distance + intensity)",
+                    _m(d["macs_per_frame_dense"]),
+                    _m(d["macs_per_frame_executed"]),
+                ],
+                [
+                    "operations per image (+ and x apart)",
+                    _m(d["operations_per_image_dense"]),
+                    _m(2 * count.macs_folded * count.windows),
+                ],
                 ["parameters", f"{count.parameters}", f"{count.parameters_folded}"],
                 ["weight bytes (float32)", f"{d['weight_bytes']}", f"{d['weight_bytes_executed']}"],
                 ["window inputs, if materialised", f"{d['input_bytes'] / 1e6:.3f} MB", "never materialised"],

@@ -21,8 +21,12 @@ __all__ = ["simulate"]
 def simulate(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write to; made if absent.")],
     frames: Annotated[int, typer.Option(min=1, max=100_000, help="Turns to simulate.")] = 10,
-    sensor: Annotated[str, typer.Option(help=f"Beam table: {', '.join(beam_table_names())}, or a .yaml file.")] = "hdl-64e",
-    columns: Annotated[int | None, typer.Option(min=16, max=65535, help="Firings per turn; the table's if omitted.")] = None,
+    sensor: Annotated[
+        str, typer.Option(help=f"Beam table: {', '.join(beam_table_names())}, or a .yaml file.")
+    ] = "hdl-64e",
+    columns: Annotated[
+        int | None, typer.Option(min=16, max=65535, help="Firings per turn; the table's if omitted.")
+    ] = None,
     rate: Annotated[float, typer.Option(help="Turns per second.")] = 20.0,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     kind: Annotated[str, typer.Option("--format", help=".bin cloud (KITTI) or .npz range image.")] = "bin",
@@ -52,5 +56,6 @@ def _write(path: Path, scan: Scan) -> None:
         return
     write_npz(
         path, distance=scan.distance, intensity=scan.intensity, surface=scan.surface,
-        distance_unit_m=np.float64(scan.distance_unit_m), elevation_deg=scan.beams.elevation_deg, cut_deg=np.float64(scan.cut_deg),
+        distance_unit_m=np.float64(scan.distance_unit_m), elevation_deg=scan.beams.elevation_deg,
+        cut_deg=np.float64(scan.cut_deg),
     )  # fmt: skip

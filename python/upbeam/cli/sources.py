@@ -1,4 +1,5 @@
-"""Where frames come from: the simulator, or a folder of recorded ones. Handed down to training, evaluation and streams."""
+"""Where frames come from: the simulator, or a folder of recorded ones. Handed down to training, evaluation and
+streams."""
 
 from __future__ import annotations
 
@@ -15,9 +16,15 @@ __all__ = ["frame_of_scan", "recipe_frames", "simulated_scans"]
 
 
 def simulated_scans(
-    beams: BeamTable, *, columns: int, frames: int, seed: int, rate_hz: float = 20.0, frames_per_scene: int | None = None,
+    beams: BeamTable,
+    *,
+    columns: int,
+    frames: int,
+    seed: int,
+    rate_hz: float = 20.0,
+    frames_per_scene: int | None = None,
     align: bool = True,
-) -> Iterator[Scan]:  # fmt: skip
+) -> Iterator[Scan]:
     """Simulated turns in order, made by all cores where that is faster than starting them."""
     settings = {
         "columns": columns, "frames": frames, "seed": seed, "rate_hz": rate_hz,
@@ -48,4 +55,3 @@ def _source_frames(source: DataRecipe, recipe: Recipe, beams: BeamTable, rules: 
         beams, columns=recipe.columns, frames=source.frames, seed=source.seed, frames_per_scene=source.frames_per_scene
     )
     yield from map(frame_of_scan, scans)
-

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -46,7 +46,9 @@ class _Feed:
 def stream(
     source: Annotated[str, typer.Option(help="'sim', a KITTI .bin frame or a folder of them.")] = "sim",
     rate: Annotated[float, typer.Option(help="Turns per second.")] = 20.0,
-    frames: Annotated[int | None, typer.Option(min=1, help="Frames to play (sim: 200; recordings: all, repeated if more).")] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Frames to play (sim: 200; recordings: all, repeated if more).")
+    ] = None,
     model: Annotated[str | None, typer.Option(help="A .ubm model instead of the shipped one.")] = None,
     backend: Annotated[str, typer.Option(help="cpu.")] = "cpu",
     precision: Annotated[str, typer.Option(help="fp32.")] = "fp32",
@@ -54,11 +56,17 @@ def stream(
     deadline_ms: Annotated[float, typer.Option(help="From the last input column to the last output column.")] = 50.0,
     clock: Annotated[str, typer.Option(help="real, or virtual (deterministic, modelled service time).")] = "real",
     column_us: Annotated[float, typer.Option(help="Virtual clock: service time of a column.")] = VIRTUAL_COLUMN_US,
-    sensor: Annotated[str | None, typer.Option(help=f"Simulated sensor ({', '.join(beam_table_names())}); the model's if omitted.")] = None,
-    any_sensor: Annotated[bool, typer.Option("--any-sensor", help="Accept a sensor that the model was not made for.")] = False,
+    sensor: Annotated[
+        str | None, typer.Option(help=f"Simulated sensor ({', '.join(beam_table_names())}); the model's if omitted.")
+    ] = None,
+    any_sensor: Annotated[
+        bool, typer.Option("--any-sensor", help="Accept a sensor that the model was not made for.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the simulator.")] = 0,
     report: Annotated[Path | None, typer.Option(help="Folder for report.html and report.json.")] = None,
-    fail_on_miss: Annotated[bool, typer.Option("--fail-on-miss", help="Exit with status 1 if a frame missed its deadline.")] = False,
+    fail_on_miss: Annotated[
+        bool, typer.Option("--fail-on-miss", help="Exit with status 1 if a frame missed its deadline.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Play a 20 Hz feed packet by packet through the column stream and judge every frame."""
@@ -77,7 +85,9 @@ def stream(
     if report is not None:
         from .stream_report import write_stream_report
 
-        summary["report"] = str(write_stream_report(report, feed.images, feed.truth, feed.pictured, loaded, result, summary))
+        source_facts = {key: str(summary[key]) for key in ("source", "sensor", "kind", "backend", "precision")}
+        page = write_stream_report(report, feed.images, feed.truth, feed.pictured, loaded, result, source_facts)
+        summary["report"] = str(page)
     if as_json:
         emit_json(summary)
     else:
@@ -87,7 +97,8 @@ def stream(
 
 
 def _feed(
-    source: str, model: Model, sensor: str | None, any_sensor: bool, frames: int | None, rate: float, seed: int, *, quiet: bool
+    source: str, model: Model, sensor: str | None, any_sensor: bool, frames: int | None, rate: float, seed: int, *,
+    quiet: bool
 ) -> _Feed:  # fmt: skip
     if source == "sim":
         return _simulated(model, sensor or model.rules.sensor, any_sensor, frames or 200, rate, seed, quiet)
@@ -102,18 +113,25 @@ def _simulated(
     model: Model, sensor: str, any_sensor: bool, frames: int, rate: float, seed: int, quiet: bool
 ) -> _Feed:  # fmt: skip
     if sensor != model.rules.sensor and not any_sensor:
-        raise UserError(f"--sensor {sensor}: the model was made for {model.rules.sensor}; --any-sensor plays it all the same")
+        raise UserError(
+            f"--sensor {sensor}: the model was made for {model.rules.sensor}; --any-sensor plays it all the same"
+        )
     with_truth = sensor.endswith("/2")
     beams = beam_table(sensor.removesuffix("/2"))
     if with_truth is False and beams.beams != BEAMS:
-        raise UserError(f"--sensor {sensor}: has {beams.beams} beams, expected {BEAMS} (hdl-64e/2 takes every other of 64)")
+        raise UserError(
+            f"--sensor {sensor}: has {beams.beams} beams, expected {BEAMS} (hdl-64e/2 takes every other of 64)"
+        )
     if beams.distance_unit_m != model.distance_unit_m:
-        raise UserError(f"--sensor {sensor}: counts of {beams.distance_unit_m} m, the model's are {model.distance_unit_m} m")
+        raise UserError(
+            f"--sensor {sensor}: counts of {beams.distance_unit_m} m, the model's are {model.distance_unit_m} m"
+        )
     step = 2 if with_truth else 1
     distance = np.zeros((frames, BEAMS, model.columns), np.uint16)
     intensity = np.zeros((frames, BEAMS, model.columns), np.uint8)
     pictured, truth = frames // 2, None
-    # Recorded range images are azimuth aligned, and so is the model made from them; a native sensor sends firing columns.
+    # Recorded range images are azimuth aligned, and so is the model made from them; a native sensor sends firing
+    # columns.
     aligned = with_truth
     scans = simulated_scans(beams, columns=model.columns, frames=frames, seed=seed, rate_hz=rate, align=aligned)
     with progress_bar(f"simulating {sensor}", frames, quiet=quiet) as advance:
@@ -127,7 +145,10 @@ def _simulated(
 
 def _recorded(source: str, model: Model, frames: int | None, quiet: bool) -> _Feed:
     files = kitti_files(source)[:frames]
-    images = np.zeros((len(files), ROWS, model.columns), np.uint16), np.zeros((len(files), ROWS, model.columns), np.uint8)
+    images = (
+        np.zeros((len(files), ROWS, model.columns), np.uint16),
+        np.zeros((len(files), ROWS, model.columns), np.uint8),
+    )
     with progress_bar("reading frames", len(files), quiet=quiet) as advance:
         for k, path in enumerate(files):
             image = image_of_cloud(read_cloud(path), path, model.rules)
@@ -135,12 +156,12 @@ def _recorded(source: str, model: Model, frames: int | None, quiet: bool) -> _Fe
             advance()
     pictured = len(files) // 2
     truth = images[0][pictured], images[1][pictured]
-    return _Feed(f"{source} ({len(files)} frames)", (images[0][:, ::2], images[1][:, ::2]), truth, pictured, True, "hdl-64e/2")
+    return _Feed(
+        f"{source} ({len(files)} frames)", (images[0][:, ::2], images[1][:, ::2]), truth, pictured, True, "hdl-64e/2"
+    )
 
 
 def _play(feed: _Feed, model: Model, config: LiveConfig, *, quiet: bool) -> LiveResult:
-    from dataclasses import replace
-
     config = replace(config, aligned=feed.aligned, keep_frames=(feed.pictured,))
     columns = firing_columns(feed.images[0]), firing_columns(feed.images[1])
     total = config.frames or len(columns[0])
@@ -149,7 +170,10 @@ def _play(feed: _Feed, model: Model, config: LiveConfig, *, quiet: bool) -> Live
 
         def show_progress(p: LiveProgress) -> None:
             nonlocal done
-            advance(p.frames - done, f"latency {p.last_latency_ms:.3f} ms, worst {p.max_latency_ms:.3f} ms, misses {p.misses}")
+            advance(
+                p.frames - done,
+                f"latency {p.last_latency_ms:.3f} ms, worst {p.max_latency_ms:.3f} ms, misses {p.misses}",
+            )
             done = p.frames
 
         return run_live(model, *columns, config, show_progress)
@@ -173,14 +197,27 @@ def _print(summary: dict[str, Any], result: LiveResult) -> None:
     latency = result.latency_ms
     rows = [
         ["frames judged / played", f"{result.counts.get('frames_judged', result.frames)} / {result.frames}"],
-        [f"missed the {result.deadline_ms:g} ms deadline", f"{result.misses} ({result.misses_unexplained} not explained by machine stalls)"],
-        *[[f"latency {name} ({kind})", f"{latency[name]:.3f} ms"] for name in ("p50", "p99", "p999", "max") if name in latency],
+        [
+            f"missed the {result.deadline_ms:g} ms deadline",
+            f"{result.misses} ({result.misses_unexplained} not explained by machine stalls)",
+        ],
+        *[
+            [f"latency {name} ({kind})", f"{latency[name]:.3f} ms"]
+            for name in ("p50", "p99", "p999", "max")
+            if name in latency
+        ],
         [f"compute per column p50 / p99.9 ({kind})", _pair(result.column_compute_us, "us")],
         ["pacer's own lateness p50 / p99.9", _pair(result.pacer_lateness_us, "us")],
         ["packets dropped", f"{result.counts.get('packets_dropped', 0)}"],
         ["instruction set", result.cpu],
     ]
-    show(table(f"{summary['source']} at {result.rate_hz:g} Hz, {result.columns} columns, {result.clock} clock", ["", "value"], rows))
+    show(
+        table(
+            f"{summary['source']} at {result.rate_hz:g} Hz, {result.columns} columns, {result.clock} clock",
+            ["", "value"],
+            rows,
+        )
+    )
     if "report" in summary:
         message(f"report: {summary['report']}")
     if result.stopped:

@@ -27,7 +27,9 @@ __all__ = ["train"]
 
 def train(
     recipe: Annotated[str, typer.Option(help=f"A recipe ({', '.join(recipe_names())}) or a .yaml file.")] = "default",
-    out: Annotated[Path, typer.Option(help="The model file to write; its loss log goes beside it as .csv.")] = Path("model.ubm"),
+    out: Annotated[Path, typer.Option(help="The model file to write; its loss log goes beside it as .csv.")] = Path(
+        "model.ubm"
+    ),
     evaluate: Annotated[str | None, typer.Option(help="A folder of KITTI .bin frames to judge the result on.")] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -30,11 +30,14 @@ def upsample(
     model: Annotated[str | None, typer.Option(help="A .ubm model instead of the shipped one.")] = None,
     precision: Annotated[str, typer.Option(help="fp32.")] = "fp32",
     backend: Annotated[str, typer.Option(help="cpu.")] = "cpu",
-    rows: Annotated[str, typer.Option(help="How a cloud's points find their rows: ring (file order) or elevation.")] = "ring",
+    rows: Annotated[
+        str, typer.Option(help="How a cloud's points find their rows: ring (file order) or elevation.")
+    ] = "ring",
     sensor_only: Annotated[bool, typer.Option(help="Write only what the sensor measured.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Upsample one frame; of 64 rows every other one is the input. Every original point is kept; generated points are marked (mask in .npz, property in .ply/.pcd)."""
+    """Upsample one frame; of 64 rows every other one is the input. Every original point is kept; generated points
+    are marked (mask in .npz, property in .ply/.pcd)."""
     if output.suffix not in FORMATS:
         raise UserError(f"{output}: unknown output format, expected one of {' '.join(FORMATS)}")
     if rows not in ("ring", "elevation"):
@@ -76,12 +79,16 @@ def _read(source: Path, model: Model, rows: RowRule) -> _Frame:
 
 def _read_image(source: Path, arrays: RangeArrays, model: Model) -> _Frame:
     if arrays.distance.shape[0] not in (BEAMS, ROWS):
-        raise CloudError(source, f"{arrays.distance.shape[0]} rows", "array", f"{BEAMS} rows, or {ROWS} to take every other of")
-    counts = arrays.distance
-    if counts.dtype != np.uint16:
-        counts, _ = to_counts(counts, model.distance_unit_m)
+        raise CloudError(
+            source, f"{arrays.distance.shape[0]} rows", "array", f"{BEAMS} rows, or {ROWS} to take every other of"
+        )
+    counts = _counts(arrays.distance, model)
     intensity = np.zeros(counts.shape, np.uint8) if arrays.intensity is None else arrays.intensity
     return _Frame(counts, intensity, None)
+
+
+def _counts(distance: NDArray[Any], model: Model) -> NDArray[np.uint16]:
+    return distance if distance.dtype == np.uint16 else to_counts(distance, model.distance_unit_m)[0]
 
 
 def _other_width(frame: _Frame, model: Model) -> int | None:
@@ -124,7 +131,8 @@ def _write_image(output: Path, distance: NDArray[np.uint16], intensity: NDArray[
 def _points(
     frame: _Frame, distance: NDArray[np.uint16], intensity: NDArray[np.uint8], model: Model
 ) -> tuple[F32, NDArray[np.bool_]]:
-    """The recording's own points, untouched, then the generated ones. An image without a cloud becomes points, row by row."""
+    """The recording's own points, untouched, then the generated ones. An image without a cloud becomes points, row
+    by row."""
     rules = model.rules
     geometry = rules.row_elevation_deg, rules.distance_unit_m, rules.cut_deg, rules.row_height_m
     if frame.cloud is None:

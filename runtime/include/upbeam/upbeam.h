@@ -2,8 +2,8 @@
  * upbeam: columns of a 32-beam LiDAR in, columns of 64 rows out.
  *
  * The library holds no state of its own: no heap, no threads, no I/O, no globals. The caller gives all memory, and
- * keeps it. Objects are opaque and live in memory whose size a getter tells. Nothing is freed: to end, forget the memory.
- * Calls on different objects may run on different threads; calls on one object may not run at the same time.
+ * keeps it. Objects are opaque and live in memory whose size a getter tells. Nothing is freed: to end, forget the
+ * memory. Calls on different objects may run on different threads; calls on one object may not run at the same time.
  *
  * Usage:
  *     static _Alignas(UPB_ALIGN) unsigned char model_memory[UPB_MODEL_BYTES_MAX];
@@ -45,29 +45,29 @@ extern "C" {
 /* Raised when a caller must be recompiled. upb_api_version() tells what the library was built with. */
 #define UPB_API_VERSION 0u
 
-#define UPB_BEAMS 32u       /* beams of an input column */
-#define UPB_ROWS 64u        /* rows of an output column */
-#define UPB_WINDOWS 31u     /* windows of a column: pairs of neighbouring beams */
-#define UPB_MAX_HIDDEN 32u  /* hidden units of a network, at most */
+#define UPB_BEAMS 32u      /* beams of an input column */
+#define UPB_ROWS 64u       /* rows of an output column */
+#define UPB_WINDOWS 31u    /* windows of a column: pairs of neighbouring beams */
+#define UPB_MAX_HIDDEN 32u /* hidden units of a network, at most */
 #define UPB_MAX_COLUMNS 65535u
-#define UPB_ALIGN 64u       /* alignment of all memory given to the library, bytes */
+#define UPB_ALIGN 64u              /* alignment of all memory given to the library, bytes */
 #define UPB_MODEL_BYTES_MAX 16384u /* upb_model_bytes() never exceeds this */
 
 typedef enum upb_status {
     UPB_OK = 0,
-    UPB_E_ARGUMENT = 1,  /* a null pointer, or a value outside its range */
-    UPB_E_SIZE = 2,      /* the caller's memory is too small: error.expected tells how much is needed */
-    UPB_E_ALIGN = 3,     /* the caller's memory is not aligned to UPB_ALIGN */
-    UPB_E_TRUNCATED = 4, /* a model file ends early, or is longer than it says */
-    UPB_E_MAGIC = 5,     /* not a .ubm model file */
-    UPB_E_VERSION = 6,   /* a format version this library does not read */
-    UPB_E_CRC = 7,       /* the model file's checksum does not match: damaged */
-    UPB_E_SECTION = 8,   /* a required section is unknown (error.what: its tag), missing, or lies outside the file */
-    UPB_E_VALUE = 9,     /* a value in the model file is impossible: error.what names it */
-    UPB_E_SENSOR = 10,   /* the stream's sensor is not the one the model was made for */
+    UPB_E_ARGUMENT = 1,   /* a null pointer, or a value outside its range */
+    UPB_E_SIZE = 2,       /* the caller's memory is too small: error.expected tells how much is needed */
+    UPB_E_ALIGN = 3,      /* the caller's memory is not aligned to UPB_ALIGN */
+    UPB_E_TRUNCATED = 4,  /* a model file ends early, or is longer than it says */
+    UPB_E_MAGIC = 5,      /* not a .ubm model file */
+    UPB_E_VERSION = 6,    /* a format version this library does not read */
+    UPB_E_CRC = 7,        /* the model file's checksum does not match: damaged */
+    UPB_E_SECTION = 8,    /* a required section is unknown (error.what: its tag), missing, or lies outside the file */
+    UPB_E_VALUE = 9,      /* a value in the model file is impossible: error.what names it */
+    UPB_E_SENSOR = 10,    /* the stream's sensor is not the one the model was made for */
     UPB_E_PRECISION = 11, /* precision not in the model, or not in this build */
-    UPB_E_CPU = 12,      /* an instruction set was asked for that this machine, or this build, does not have */
-    UPB_E_ORDER = 13     /* a column older than one already taken: dropped and counted */
+    UPB_E_CPU = 12,       /* an instruction set was asked for that this machine, or this build, does not have */
+    UPB_E_ORDER = 13      /* a column older than one already taken: dropped and counted */
 } upb_status;
 
 /* One lower-case English sentence without full stop, static, never null. */
@@ -106,17 +106,17 @@ typedef enum upb_empty_rule {
 } upb_empty_rule;
 
 typedef struct upb_model_info {
-    char sensor[32];               /* name of the beam table, zero terminated */
-    uint32_t columns;              /* per turn */
-    uint32_t distance_unit_um;     /* size of a distance count, micrometres */
-    uint32_t cut_mdeg;             /* azimuth where column 0 begins, thousandths of a degree, clockwise */
-    uint32_t min_count;            /* nearest and farthest count the network sees and gives; others are no return */
+    char sensor[32];           /* name of the beam table, zero terminated */
+    uint32_t columns;          /* per turn */
+    uint32_t distance_unit_um; /* size of a distance count, micrometres */
+    uint32_t cut_mdeg;         /* azimuth where column 0 begins, thousandths of a degree, clockwise */
+    uint32_t min_count;        /* nearest and farthest count the network sees and gives; others are no return */
     uint32_t max_count;
-    uint32_t edge;                 /* upb_edge */
-    uint32_t last_row;             /* upb_last_row */
-    uint32_t empty_rule;           /* upb_empty_rule */
-    uint32_t hidden[2];            /* hidden units: distance network, intensity network */
-    uint32_t crc32;                /* of the model file: its identity */
+    uint32_t edge;                          /* upb_edge */
+    uint32_t last_row;                      /* upb_last_row */
+    uint32_t empty_rule;                    /* upb_empty_rule */
+    uint32_t hidden[2];                     /* hidden units: distance network, intensity network */
+    uint32_t crc32;                         /* of the model file: its identity */
     int32_t row_elevation_udeg[UPB_ROWS];   /* millionths of a degree above the horizon */
     int32_t azimuth_offset_udeg[UPB_BEAMS]; /* clockwise from the firing's azimuth to the beam's */
     int32_t row_height_um[UPB_ROWS];        /* height of the row's laser origin over the sensor's, micrometres */
@@ -159,11 +159,11 @@ typedef enum upb_cpu {
 
 /* A finished column. The arrays belong to the stream and are valid during the call of the sink. */
 typedef struct upb_column {
-    uint64_t frame;            /* turns since the stream's start, from 0; the first may be partial */
-    uint32_t column;           /* 0 .. columns-1 */
-    uint32_t flags;            /* UPB_COLUMN_* */
-    const uint16_t *distance;  /* [UPB_ROWS] counts */
-    const uint8_t *intensity;  /* [UPB_ROWS] */
+    uint64_t frame;           /* turns since the stream's start, from 0; the first may be partial */
+    uint32_t column;          /* 0 .. columns-1 */
+    uint32_t flags;           /* UPB_COLUMN_* */
+    const uint16_t *distance; /* [UPB_ROWS] counts */
+    const uint8_t *intensity; /* [UPB_ROWS] */
 } upb_column;
 
 /* True for rows that no laser measured. */
@@ -173,19 +173,19 @@ static inline int upb_row_is_generated(uint32_t row) { return (int)(row & 1u); }
 typedef void (*upb_column_sink)(void *user, const upb_column *column);
 
 typedef struct upb_stream_config {
-    uint32_t struct_bytes;    /* sizeof(upb_stream_config), set by upb_stream_config_default */
-    uint32_t precision;       /* upb_precision */
-    uint32_t cpu;             /* upb_cpu: force one instruction set, e.g. for tests */
-    uint32_t reorder_columns; /* a column at most this far behind the last one (0: the same again) is late, dropped and
-                                 counted; farther is a gap. 1..columns/2; 0: 64, or columns/2 if that is less */
+    uint32_t struct_bytes;     /* sizeof(upb_stream_config), set by upb_stream_config_default */
+    uint32_t precision;        /* upb_precision */
+    uint32_t cpu;              /* upb_cpu: force one instruction set, e.g. for tests */
+    uint32_t reorder_columns;  /* a column at most this far behind the last one (0: the same again) is late, dropped and
+                                  counted; farther is a gap. 1..columns/2; 0: 64, or columns/2 if that is less */
     uint32_t distance_unit_um; /* unit of the stream's counts; 0: the model's. Another unit is refused (SENSOR) */
-    uint32_t columns;         /* columns per turn of the stream; 0: the model's. Another width is refused (SENSOR)
-                                 unless any_sensor */
-    uint32_t any_sensor;      /* 1: take a stream of another width */
-    uint32_t aligned;         /* 1: columns come azimuth aligned, as range images are; the model's offsets are not applied */
-    uint32_t reserved[8];     /* 0 */
-    upb_column_sink sink;     /* called in order with every finished column; may be null */
-    void *user;               /* handed to the sink */
+    uint32_t columns;          /* columns per turn of the stream; 0: the model's. Another width is refused (SENSOR)
+                                  unless any_sensor */
+    uint32_t any_sensor;       /* 1: take a stream of another width */
+    uint32_t aligned; /* 1: columns come azimuth aligned, as range images are; the model's offsets are not applied */
+    uint32_t reserved[8]; /* 0 */
+    upb_column_sink sink; /* called in order with every finished column; may be null */
+    void *user;           /* handed to the sink */
 } upb_stream_config;
 
 UPB_API upb_stream_config upb_stream_config_default(void);
@@ -196,10 +196,11 @@ typedef struct upb_stream_stats {
     uint64_t columns_missing; /* never arrived: inserted as no return */
     uint64_t columns_late;    /* arrived behind a later one: dropped */
     uint64_t frames_out;      /* frames whose last column was handed out */
-    uint32_t delay_columns;   /* pushes from a column's own to the one that hands it out: the destagger ring's, and one for
-                                 the right neighbour. The last column of a turn under UPB_EDGE_ZERO is one push earlier */
-    uint32_t cpu;             /* upb_cpu in use */
-    uint32_t state_bytes;     /* of the stream's memory that is read or written */
+    uint32_t
+        delay_columns;    /* pushes from a column's own to the one that hands it out: the destagger ring's, and one for
+                             the right neighbour. The last column of a turn under UPB_EDGE_ZERO is one push earlier */
+    uint32_t cpu;         /* upb_cpu in use */
+    uint32_t state_bytes; /* of the stream's memory that is read or written */
     uint32_t reserved;
 } upb_stream_stats;
 
@@ -217,23 +218,23 @@ UPB_API upb_status upb_stream_init(void *memory, size_t memory_bytes, const upb_
 /*
  * Takes one firing column: `column` is its place in the turn (0 .. columns-1), `distance` and `intensity` hold
  * UPB_BEAMS values. Columns that were skipped since the last call are inserted as no return and counted. Calls the sink
- * for each column that becomes complete: normally one, more after a gap or at a `zero` edge, none at the start of a stream.
- * A stream begins and ends with an edge: its first finished column is the first pushed one. (Where the azimuth offsets of
- * all beams have one sign, the columns of the output are counted from the nearest offset on.)
- * Errors: ARGUMENT (nothing taken), ORDER (a late column: nothing taken, counted).
+ * for each column that becomes complete: normally one, more after a gap or at a `zero` edge, none at the start of a
+ * stream. A stream begins and ends with an edge: its first finished column is the first pushed one. (Where the azimuth
+ * offsets of all beams have one sign, the columns of the output are counted from the nearest offset on.) Errors:
+ * ARGUMENT (nothing taken), ORDER (a late column: nothing taken, counted).
  */
 UPB_API upb_status upb_stream_push(upb_stream *stream, uint32_t column, const uint16_t *distance,
                                    const uint8_t *intensity);
 
 /*
- * Inserts `columns` columns that never arrived. Before the first push, and after a flush, it does nothing. Each costs as
- * much as a pushed one. Errors: ARGUMENT (more than 16 turns).
+ * Inserts `columns` columns that never arrived. Before the first push, and after a flush, it does nothing. Each costs
+ * as much as a pushed one. Errors: ARGUMENT (more than 16 turns).
  */
 UPB_API upb_status upb_stream_gap(upb_stream *stream, uint32_t columns);
 
 /*
- * Ends the stream with an edge: hands out what is pending, up to the last pushed column (or inserted one). The next push
- * starts a new frame wherever it stands; the frame number goes on.
+ * Ends the stream with an edge: hands out what is pending, up to the last pushed column (or inserted one). The next
+ * push starts a new frame wherever it stands; the frame number goes on.
  */
 UPB_API upb_status upb_stream_flush(upb_stream *stream);
 
@@ -247,10 +248,10 @@ UPB_API upb_status upb_stream_get_stats(const upb_stream *stream, upb_stream_sta
  * the finished columns side by side, in order, into images of UPB_ROWS rows. Rows are `*_stride` elements apart.
  * The stream carries the pending columns over to the next call, so that a sequence of calls gives the same bits as
  * upb_stream_push column by column: a call finishes `columns` columns, the first one upb_stream_stats.delay_columns
- * fewer, upb_stream_frame_end the rest. (Under UPB_EDGE_ZERO without azimuth offsets every call finishes its own frame.)
- * `out_capacity` is the width of the output images, at least `columns`; *out_columns tells how many were written.
- * The stream must stand at the start of a turn (new, flushed, or column columns-1 taken last). The sink is not called.
- * Input and output must not overlap. Errors: ARGUMENT (also: inside a turn, a stride less than a row), SIZE.
+ * fewer, upb_stream_frame_end the rest. (Under UPB_EDGE_ZERO without azimuth offsets every call finishes its own
+ * frame.) `out_capacity` is the width of the output images, at least `columns`; *out_columns tells how many were
+ * written. The stream must stand at the start of a turn (new, flushed, or column columns-1 taken last). The sink is not
+ * called. Input and output must not overlap. Errors: ARGUMENT (also: inside a turn, a stride less than a row), SIZE.
  */
 UPB_API upb_status upb_stream_frame(upb_stream *stream, const uint16_t *distance, size_t distance_stride,
                                     const uint8_t *intensity, size_t intensity_stride, uint16_t *out_distance,
@@ -258,8 +259,8 @@ UPB_API upb_status upb_stream_frame(upb_stream *stream, const uint16_t *distance
                                     uint32_t out_capacity, uint32_t *out_columns);
 
 /*
- * upb_stream_flush for the whole-frame call: writes the pending columns, at most delay_columns of them. The strides must not
- * be less than `out_capacity`. Errors: ARGUMENT, SIZE (nothing done).
+ * upb_stream_flush for the whole-frame call: writes the pending columns, at most delay_columns of them. The strides
+ * must not be less than `out_capacity`. Errors: ARGUMENT, SIZE (nothing done).
  */
 UPB_API upb_status upb_stream_frame_end(upb_stream *stream, uint16_t *out_distance, size_t out_distance_stride,
                                         uint8_t *out_intensity, size_t out_intensity_stride, uint32_t out_capacity,
@@ -269,8 +270,8 @@ UPB_API upb_status upb_stream_frame_end(upb_stream *stream, uint16_t *out_distan
 
 /*
  * Latencies in nanoseconds in fixed memory: exact below 64 ns, then 32 buckets an octave (a quantile is at most 1/32
- * above the true one, never below), up to 2^40 ns (18 minutes); what is longer is counted in the last bucket. The maximum
- * and the sum are exact.
+ * above the true one, never below), up to 2^40 ns (18 minutes); what is longer is counted in the last bucket. The
+ * maximum and the sum are exact.
  */
 #define UPB_HISTOGRAM_BUCKETS 1152u
 
@@ -299,8 +300,8 @@ typedef struct upb_clock {
 
 typedef enum upb_verdict {
     UPB_VERDICT_MET = 0,
-    UPB_VERDICT_MISSED = 1,   /* latency above the deadline */
-    UPB_VERDICT_PARTIAL = 2   /* the frame began or ended outside the stream: shown, not judged */
+    UPB_VERDICT_MISSED = 1, /* latency above the deadline */
+    UPB_VERDICT_PARTIAL = 2 /* the frame began or ended outside the stream: shown, not judged */
 } upb_verdict;
 
 typedef enum upb_mode { UPB_MODE_NETWORK = 0 } upb_mode;
@@ -324,26 +325,26 @@ typedef struct upb_ledger {
     upb_ledger_record *records; /* the caller's ring of the last `capacity` closed frames */
     uint32_t capacity;
     uint32_t open_count;
-    upb_ledger_record open[4];  /* frames received in part, oldest first */
-    uint64_t closed;            /* frames closed: record k of the ring is frame count k modulo capacity */
+    upb_ledger_record open[4]; /* frames received in part, oldest first */
+    uint64_t closed;           /* frames closed: record k of the ring is frame count k modulo capacity */
     uint64_t missed;
     uint64_t partial;
-    uint64_t lost;              /* frames opened that never closed: pushed out by newer ones */
-    upb_histogram latency;      /* of the frames judged */
+    uint64_t lost;         /* frames opened that never closed: pushed out by newer ones */
+    upb_histogram latency; /* of the frames judged */
 } upb_ledger;
 
 /* `records` (capacity >= 1) belongs to the caller and must outlive the ledger. Errors: ARGUMENT. */
 UPB_API upb_status upb_ledger_init(upb_ledger *ledger, upb_ledger_record *records, uint32_t capacity,
                                    uint64_t deadline_ns, upb_clock clock);
 /*
- * A column of `frame` was received at `received_ns` (the ledger's clock). Frames begin in order. Errors: ARGUMENT (a time
- * before that of the frame's last column; a frame that was closed, or is older than one that was received).
+ * A column of `frame` was received at `received_ns` (the ledger's clock). Frames begin in order. Errors: ARGUMENT (a
+ * time before that of the frame's last column; a frame that was closed, or is older than one that was received).
  */
 UPB_API upb_status upb_ledger_input(upb_ledger *ledger, uint64_t frame, uint64_t received_ns);
 /*
- * The last output column of `frame` is complete now (reads the clock): closes its record. `partial` is not 0 for a frame
- * that began or ended outside the stream. The record is copied to *record unless null. Errors: ARGUMENT (frame not open; the
- * clock stands before the frame's last input: nothing is closed).
+ * The last output column of `frame` is complete now (reads the clock): closes its record. `partial` is not 0 for a
+ * frame that began or ended outside the stream. The record is copied to *record unless null. Errors: ARGUMENT (frame
+ * not open; the clock stands before the frame's last input: nothing is closed).
  */
 UPB_API upb_status upb_ledger_output(upb_ledger *ledger, uint64_t frame, uint32_t missing_columns, uint32_t partial,
                                      uint32_t mode, upb_ledger_record *record);

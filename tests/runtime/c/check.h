@@ -26,7 +26,8 @@ static inline int check_equal(uint64_t got, uint64_t expected, const char *text,
     return ok;
 }
 
-#define CHECK_EQUAL(got, expected) check_equal((uint64_t)(got), (uint64_t)(expected), #got " == " #expected, __FILE__, __LINE__)
+#define CHECK_EQUAL(got, expected)                                                                                     \
+    check_equal((uint64_t)(got), (uint64_t)(expected), #got " == " #expected, __FILE__, __LINE__)
 
 /* The exit status of a test program. */
 static inline int check_report(const char *name) {
@@ -59,9 +60,7 @@ static inline uint32_t random_below(random_source *source, uint32_t limit) {
 }
 
 /* -1 .. 1 */
-static inline float random_signed(random_source *source) {
-    return (float)random_u32(source) / 2147483648.0f - 1.0f;
-}
+static inline float random_signed(random_source *source) { return (float)random_u32(source) / 2147483648.0f - 1.0f; }
 
 /* The value after `name` on the command line, or `otherwise`. */
 static inline unsigned long option_number(int argc, char **argv, const char *name, unsigned long otherwise) {

@@ -1,6 +1,5 @@
 /* The public header compiles alone, first and twice, and every call links from the shared library. */
 #include "upbeam/upbeam.h"
-#include "upbeam/upbeam.h"
 
 #include "check.h"
 
@@ -15,7 +14,8 @@ int main(void) {
     CHECK(upb_model_bytes() <= UPB_MODEL_BYTES_MAX);
     CHECK(!upb_row_is_generated(0) && upb_row_is_generated(63));
     for (int status = UPB_OK; status <= UPB_E_ORDER; status++)
-        CHECK(strlen(upb_status_text((upb_status)status)) > 5 && strcmp(upb_status_text((upb_status)status), "unknown status"));
+        CHECK(strlen(upb_status_text((upb_status)status)) > 5 &&
+              strcmp(upb_status_text((upb_status)status), "unknown status"));
     CHECK(strcmp(upb_status_text((upb_status)(UPB_E_ORDER + 1)), "unknown status") == 0);
     CHECK(strcmp(upb_status_text((upb_status)-1), "unknown status") == 0);
     return check_report("header (C)");

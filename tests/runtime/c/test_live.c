@@ -1,12 +1,13 @@
 /*
- * The real-time runner: queueing on virtual time against calculations by hand, accounts of a run on real threads. Wall-clock
- * time is never checked. Run it under the thread sanitizer as well.
+ * The real-time runner: queueing on virtual time against calculations by hand, accounts of a run on real threads.
+ * Wall-clock time is never checked. Run it under the thread sanitizer as well.
  */
 #include <pthread.h>
 #include <stdatomic.h>
 #include <time.h>
 
 #include "check.h"
+#include "live_ring.h"
 #include "ubm_writer.h"
 #include "upb_live.h"
 
@@ -152,14 +153,16 @@ static void test_jitter(void) {
     CHECK_EQUAL(r->frames[0].record.last_input_ns, 12 * MS);
     CHECK_EQUAL(r->frames[0].record.latency_ns, 2 * MS); /* packets 1 and 2 arrive together, at 12 ms */
     CHECK_EQUAL(r->frames[0].wait_ns, 0);
+    CHECK_EQUAL(r->frames[1].record.first_input_ns, 12 * MS);
     CHECK_EQUAL(r->pacer_lateness.max_ns, 7 * MS);
     check_accounts(r);
     upb_live_destroy(live);
 }
 
 /*
- * Two places, service 8 ms, arrivals every 5 ms. Services end at 8, 16, 24, so packet 3 at 15 ms finds both places taken; with
- * 32, 40 packet 6 at 30 ms; with 48, 56 packet 9 at 45 ms (packet 8 at 40 ms takes the place just freed); 64: packet 11 at 55 ms.
+ * Two places, service 8 ms, arrivals every 5 ms. Services end at 8, 16, 24, so packet 3 at 15 ms finds both places
+ * taken; with 32, 40 packet 6 at 30 ms; with 48, 56 packet 9 at 45 ms (packet 8 at 40 ms takes the place just freed);
+ * 64: packet 11 at 55 ms.
  */
 static void test_overflow_by_hand(void) {
     upb_live_config config = slow_config();
@@ -258,6 +261,85 @@ static void test_shifted_sensor(void) {
         check_accounts(r);
         upb_live_destroy(live);
     }
+
+    /* The last packet holds all that was to come of the last frame. */
+    const uint64_t drop[] = {2 * FRAMES - 1};
+    config.drop_packets = drop;
+    config.drop_count = 1;
+    upb_live *live = run(load_model(UPB_EDGE_SEAM, 2), &config);
+    const upb_live_result *r = upb_live_get_result(live);
+    CHECK_EQUAL(r->frames_begun, FRAMES + 1);
+    CHECK_EQUAL(r->frames_empty, 1);
+    check_accounts(r);
+    upb_live_destroy(live);
+}
+
+/* Frame 0 is lost as a whole, and the stream begins within frame 1. */
+static void test_late_beginning(void) {
+    upb_live_config config = slow_config();
+    const uint64_t drop[] = {0, 1, 2};
+    config.drop_packets = drop;
+    config.drop_count = 3;
+    upb_live *live = run(load_model(UPB_EDGE_SEAM, 0), &config);
+    const upb_live_result *r = upb_live_get_result(live);
+    CHECK_EQUAL(r->frames_empty, 1);
+    CHECK_EQUAL(r->frames[0].record.frame, 1);
+    CHECK_EQUAL(r->frames[0].record.verdict, UPB_VERDICT_PARTIAL);
+    CHECK_EQUAL(r->frames[0].record.missing_columns, 12);
+    CHECK_EQUAL(r->frames[1].record.verdict, UPB_VERDICT_MET);
+    check_accounts(r);
+    upb_live_destroy(live);
+}
+
+/* ------------------------------------------------------------------------------------------------------- parts */
+
+static void test_ring(void) {
+    live_ring ring;
+    live_packet packet = {.columns = PER_PACKET, .distance = distance, .intensity = intensity};
+
+    CHECK(live_ring_init(&ring, 4, PER_PACKET));
+    CHECK(live_ring_peek(&ring) == NULL);
+    for (uint64_t i = 0; i < 10; i++) {
+        for (packet.sequence = 4 * i; packet.sequence < 4 * i + 4; packet.sequence++) {
+            packet.distance = distance + packet.sequence * UPB_BEAMS;
+            CHECK(live_ring_put(&ring, &packet));
+        }
+        CHECK(!live_ring_put(&ring, &packet));
+        for (uint64_t k = 0; k < 4; k++) {
+            const live_packet *got = live_ring_peek(&ring);
+            const uint16_t *sent = distance + (4 * i + k) * UPB_BEAMS;
+            CHECK_EQUAL(got->sequence, 4 * i + k);
+            CHECK(got->distance != sent); /* copied */
+            CHECK_EQUAL(memcmp(got->distance, sent, PER_PACKET * UPB_BEAMS * sizeof *sent), 0);
+            CHECK_EQUAL(memcmp(got->intensity, intensity, PER_PACKET * UPB_BEAMS), 0);
+            live_ring_release(&ring);
+        }
+        CHECK(live_ring_peek(&ring) == NULL);
+    }
+    live_ring_free(&ring);
+}
+
+/* Packets of 10 columns in frames of 24, played again and again: each packet full and when due, each frame the same. */
+static void test_frames_played_again(void) {
+    upb_live_config config = slow_config();
+    const uint64_t keep[] = {2, 2 + FRAMES};
+    config.frames_total = 2 * FRAMES + 1;
+    config.columns_per_packet = 10;
+    config.keep_frames = keep;
+    config.keep_count = 2;
+    upb_live *live = run(load_model(UPB_EDGE_SEAM, 0), &config);
+    const upb_live_result *r = upb_live_get_result(live);
+    const size_t pixels = COLUMNS * UPB_ROWS;
+    CHECK_EQUAL(r->packets_played, (2 * FRAMES + 1) * COLUMNS / 10 + 1);
+    CHECK_EQUAL(r->pacer_lateness.max_ns, 0);
+    CHECK_EQUAL(r->kept[1].columns_out, COLUMNS);
+    CHECK_EQUAL(memcmp(r->kept[0].distance, r->kept[1].distance, pixels * sizeof *r->kept[0].distance), 0);
+    CHECK_EQUAL(memcmp(r->kept[0].intensity, r->kept[1].intensity, pixels), 0);
+    CHECK_EQUAL(r->last.frame, 2 * FRAMES);
+    for (size_t column = 0; column < COLUMNS; column++) /* the first frame again, beyond the arrays' end */
+        CHECK_EQUAL(r->last.distance[column * UPB_ROWS], distance[column * UPB_BEAMS]);
+    check_accounts(r);
+    upb_live_destroy(live);
 }
 
 static void test_deterministic(void) {
@@ -393,6 +475,9 @@ int main(void) {
     test_dropped_packets();
     test_many_turns_lost();
     test_shifted_sensor();
+    test_late_beginning();
+    test_ring();
+    test_frames_played_again();
     test_deterministic();
     test_explains();
     test_refusals();

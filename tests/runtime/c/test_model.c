@@ -1,6 +1,6 @@
 /*
- * The model loader: good files, damaged ones, impossible ones. Options: --seed N, --count N (files of the mutation loop).
- * Run it under the sanitizers too: a file is copied to a heap block of exactly its size before it is read.
+ * The model loader: good files, damaged ones, impossible ones. Options: --seed N, --count N (files of the mutation
+ * loop). Run it under the sanitizers too: a file is copied to a heap block of exactly its size before it is read.
  */
 #include <math.h>
 
@@ -267,15 +267,15 @@ static const wrong_field wrong_fields[] = {
     {12, 4, 0, UPB_E_VALUE, "sections"},
     {12, 4, 33, UPB_E_VALUE, "sections"},
     {31, 1, 1, UPB_E_VALUE, "reserved"},
-    {32 + 8, 4, SENS + 4, UPB_E_SECTION, "SENS"},        /* not a multiple of 8 */
-    {32 + 8, 4, SENS - 8, UPB_E_SECTION, "SENS"},        /* in the table */
-    {32 + 8, 4, 1 << 20, UPB_E_SECTION, "SENS"},         /* outside the file */
-    {32 + 12, 4, 0xfffffff8, UPB_E_SECTION, "SENS"},     /* offset + bytes overflows */
-    {48 + 8, 4, SENS + 696, UPB_E_SECTION, "NETW"},      /* overlaps */
+    {32 + 8, 4, SENS + 4, UPB_E_SECTION, "SENS"},    /* not a multiple of 8 */
+    {32 + 8, 4, SENS - 8, UPB_E_SECTION, "SENS"},    /* in the table */
+    {32 + 8, 4, 1 << 20, UPB_E_SECTION, "SENS"},     /* outside the file */
+    {32 + 12, 4, 0xfffffff8, UPB_E_SECTION, "SENS"}, /* offset + bytes overflows */
+    {48 + 8, 4, SENS + 696, UPB_E_SECTION, "NETW"},  /* overlaps */
     {48 + 12, 4, 0x7fffffff, UPB_E_SECTION, "NETW"},
-    {32 + 12, 4, 696, UPB_E_VALUE, "gap"},               /* what is left over is not 0 */
+    {32 + 12, 4, 696, UPB_E_VALUE, "gap"}, /* what is left over is not 0 */
     {SENS + 0, 1, 7, UPB_E_VALUE, "SENS.name[0]"},
-    {SENS + 20, 1, 'x', UPB_E_VALUE, "SENS.name[20]"},   /* behind the end */
+    {SENS + 20, 1, 'x', UPB_E_VALUE, "SENS.name[20]"}, /* behind the end */
     {SENS + 32, 4, 31, UPB_E_VALUE, "SENS.beams"},
     {SENS + 36, 4, 3, UPB_E_VALUE, "SENS.columns"},
     {SENS + 36, 4, 65536, UPB_E_VALUE, "SENS.columns"},
@@ -300,8 +300,8 @@ static const wrong_field wrong_fields[] = {
     {NETW + 4, 4, 0, UPB_E_VALUE, "NETW[0].hidden"},
     {NETW + 4, 4, 33, UPB_E_VALUE, "NETW[0].hidden"},
     {NETW_1, 4, 33, UPB_E_VALUE, "NETW[1].hidden"},
-    {NETW_1, 4, 11, UPB_E_VALUE, "NETW.bytes"},  /* too long for its networks */
-    {NETW_1, 4, 13, UPB_E_VALUE, "NETW.bytes"},  /* too short */
+    {NETW_1, 4, 11, UPB_E_VALUE, "NETW.bytes"}, /* too long for its networks */
+    {NETW_1, 4, 13, UPB_E_VALUE, "NETW.bytes"}, /* too short */
     {NETW + 8, 4, 2, UPB_E_VALUE, "NETW[0].flags"},
     {NETW + 12, 4, 0x3f800001, UPB_E_VALUE, "NETW[0].slope"},
     {NETW + 12, 4, 0xbf000000, UPB_E_VALUE, "NETW[0].slope"},

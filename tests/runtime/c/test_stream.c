@@ -1,7 +1,7 @@
 /*
- * The column stream against an oracle that sees the whole segment at once: every finished column worked out by the rules of
- * docs/model-format.md from the file's own numbers, in double precision, one window at a time.
- * Options: --seed N, --count N (random scenarios).
+ * The column stream against an oracle that sees the whole segment at once: every finished column worked out by the
+ * rules of docs/model-format.md from the file's own numbers, in double precision, one window at a time. Options: --seed
+ * N, --count N (random scenarios).
  */
 #include <math.h>
 
@@ -227,7 +227,8 @@ static open_stream open_with(const test_model *m, upb_stream_config config) {
     upb_error error;
     size_t bytes = 0;
     s.model_memory = aligned_memory(upb_model_bytes());
-    if (upb_model_load(s.model_memory, upb_model_bytes(), file, write_ubm(file, m, NULL, 0), &s.model, &error) != UPB_OK ||
+    if (upb_model_load(s.model_memory, upb_model_bytes(), file, write_ubm(file, m, NULL, 0), &s.model, &error) !=
+            UPB_OK ||
         upb_stream_bytes(s.model, &config, &bytes, &error) != UPB_OK) {
         fprintf(stderr, "cannot open: %s\n", error.what);
         exit(2);
@@ -440,7 +441,8 @@ static void compare_frames(random_source *random, uint8_t edge, int32_t reach, u
     open_stream s = open_with(&m, collecting(UPB_CPU_AUTO));
     upb_stream_stats stats;
     upb_stream_get_stats(s.stream, &stats);
-    const unsigned at_end = edge == UPB_EDGE_ZERO && stats.delay_columns == 1 ? 0 : stats.delay_columns; /* pending after a turn */
+    const unsigned at_end =
+        edge == UPB_EDGE_ZERO && stats.delay_columns == 1 ? 0 : stats.delay_columns; /* pending after a turn */
     const uint32_t stride = columns + PAD;
     uint16_t *in_d = calloc(32 * stride, 2), *out_d = calloc(64 * stride, 2);
     uint8_t *in_i = calloc(32 * stride, 1), *out_i = calloc(64 * stride, 1);
@@ -457,8 +459,9 @@ static void compare_frames(random_source *random, uint8_t edge, int32_t reach, u
         memset(out_d, 0xee, 64 * stride * 2);
         memset(out_i, 0xee, 64 * stride);
         if (turn < TURNS) {
-            CHECK_EQUAL(upb_stream_frame(frames.stream, in_d, stride, in_i, stride, out_d, stride, out_i, stride, columns,
-                                         &written), UPB_OK);
+            CHECK_EQUAL(upb_stream_frame(frames.stream, in_d, stride, in_i, stride, out_d, stride, out_i, stride,
+                                         columns, &written),
+                        UPB_OK);
             CHECK_EQUAL(written, turn ? columns : columns - at_end);
         } else {
             upb_stream_flush(s.stream);
