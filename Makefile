@@ -4,9 +4,10 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 NATIVE := CMakeLists.txt $(shell find kernels/cpu runtime -name '*.[ch]' -o -name '*.cpp' -o -name 'CMakeLists.txt')
+SHELL  := bash
 SHARED := $(firstword $(wildcard ../shared/data))
 
-.PHONY: help setup demo test test-train lint bench soak model stubs clean
+.PHONY: help setup demo test test-c test-c-all test-train lint bench soak dist model stubs clean
 .DELETE_ON_ERROR:
 
 help:
@@ -47,17 +48,27 @@ $(VENV)/.train: $(VENV)/.dev
 demo: $(VENV)/.installed
 	@$(BIN)/upbeam stream --source sim --frames 200 --report build/demo
 
-test: $(VENV)/.dev build/c/build.ninja
-	@$(MAKE) --no-print-directory test-c
+test: $(VENV)/.dev test-c
 	$(BIN)/python -m pytest -m "not train"
 
-build/c/build.ninja: $(VENV)/.tools CMakeLists.txt
-	@$(BIN)/cmake -S . -B build/c -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja -DCMAKE_BUILD_TYPE=Release -DUPBEAM_TESTS=ON -DUPBEAM_WERROR=ON > build/c-configure.log 2>&1 || { cat build/c-configure.log; exit 1; }
+# $(call c_tests,FOLDER,CMAKE OPTIONS,CTEST OPTIONS): configure, build, run one variant of the C tests.
+CMAKE := $(abspath $(BIN))/cmake
+define c_tests
+	@mkdir -p build
+	@$(CMAKE) -S . -B build/$(1) -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja -DUPBEAM_TESTS=ON -DUPBEAM_WERROR=ON $(2) \
+		> build/$(1).log 2>&1 && $(CMAKE) --build build/$(1) >> build/$(1).log 2>&1 || { tail -40 build/$(1).log; exit 1; }
+	@echo "== C tests: $(1)"
+	@$(abspath $(BIN))/ctest --test-dir build/$(1) --output-on-failure $(3) | grep -v "Start \|^Internal\|^$$" ; exit $${PIPESTATUS[0]}
+endef
 
-.PHONY: test-c
-test-c: build/c/build.ninja
-	@$(BIN)/cmake --build build/c
-	@$(BIN)/ctest --test-dir build/c --output-on-failure
+test-c: $(VENV)/.tools
+	$(call c_tests,c,-DCMAKE_BUILD_TYPE=Release)
+
+test-c-all: $(VENV)/.tools
+	$(call c_tests,c-sanitize,-DCMAKE_BUILD_TYPE=RelWithDebInfo -DUPBEAM_SANITIZE=ON)
+	$(call c_tests,c-thread,-DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_C_FLAGS=-fsanitize=thread,-R "live|stream")
+	$(call c_tests,c-clang,-DCMAKE_BUILD_TYPE=Release -DCMAKE_C_COMPILER=clang)
+	$(call c_tests,c-aarch64,-DCMAKE_BUILD_TYPE=Release -DCMAKE_TOOLCHAIN_FILE=runtime/cmake/aarch64.cmake)
 
 test-train: $(VENV)/.train
 	$(BIN)/python -m pytest -m train
@@ -71,6 +82,23 @@ lint: $(VENV)/.dev
 
 model: $(VENV)/.train
 	$(BIN)/upbeam train --recipe default --out quant/models/default.ubm --evaluate $(SHARED)/kitti/frames
+
+bench: test-c
+	build/c/tests/kernels/checkkernels --bench --model quant/models/default.ubm
+
+# What takes minutes: a ten-minute stream in real time, a million damaged model files, more random scenarios.
+soak: test-c $(VENV)/.dev
+	build/c/tests/runtime/c/test_model --count 1000000
+	build/c/tests/runtime/c/test_stream --count 20000
+	$(BIN)/upbeam stream --frames 12000 --report build/soak
+
+dist: $(VENV)/.dev
+	@rm -rf build/dist build/dist-venv
+	@$(BIN)/python -m build --outdir build/dist . > build/dist.log 2>&1 || { tail -40 build/dist.log; exit 1; }
+	@$(PYTHON) -m venv build/dist-venv
+	@build/dist-venv/bin/python -m pip install --quiet --disable-pip-version-check build/dist/*.whl
+	@cd build && dist-venv/bin/upbeam doctor --json > dist-doctor.json && dist-venv/bin/upbeam stream --frames 5 --clock virtual --json > /dev/null
+	@ls -l build/dist | awk 'NR > 1 { print $$NF ": " $$5 " bytes" }'
 
 stubs: $(VENV)/.installed
 	$(BIN)/python -m nanobind.stubgen -m upbeam.runtime._native -o runtime/_native.pyi

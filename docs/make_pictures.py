@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+
 import upbeam
 from upbeam.hw_sim import simulate_frames
 from upbeam.model.beams import beam_table

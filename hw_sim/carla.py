@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
 from upbeam.model.io import CloudError, read_cloud
 
 __all__ = ["read_carla"]

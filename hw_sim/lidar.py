@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
 from upbeam.model.beams import BeamTable
 
 from .ground import Ground

@@ -10,6 +10,7 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
+
 from upbeam.model.beams import BeamTable
 
 from .lidar import Lidar, LidarConfig, Scan

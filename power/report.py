@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+
 from upbeam.runtime.live import quantiles_ms
 
 from .pictures import (

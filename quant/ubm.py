@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from upbeam.model.network import FoldedNetwork, WindowNetwork
 from upbeam.model.rules import BEAMS, ROWS, Rules, RulesError
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
 from upbeam.model.rules import BEAMS
 
 from ._native import LiveConfig as NativeConfig

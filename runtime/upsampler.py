@@ -9,6 +9,7 @@ from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
+
 from upbeam.model.geometry import to_counts, to_metres
 from upbeam.model.rules import BEAMS, ROWS, Rules
 from upbeam.quant.ubm import ModelFile, UbmError, read_ubm

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 import upbeam
 
 ROOT = Path(__file__).resolve().parent.parent

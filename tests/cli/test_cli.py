@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 import upbeam
 from upbeam.model.io import read_cloud, read_ply
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from upbeam.hw_sim import read_carla
 from upbeam.model.io import CloudError
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from upbeam.hw_sim import (
     SCENE_KINDS,
     Ground,

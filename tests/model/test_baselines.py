@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from upbeam.model.baselines import BASELINES, bilinear, nearest, valid_mean
 from upbeam.model.beams import uniform_beam_table
 from upbeam.model.rules import Rules

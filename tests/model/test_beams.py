@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+
 from upbeam.model.beams import BeamTableError, beam_table, beam_table_names, between_rows, uniform_beam_table
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from upbeam.model.beams import beam_table
 from upbeam.model.frames import image_of_cloud, kitti_files, kitti_frames
 from upbeam.model.geometry import recover_rings, to_points

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+
 from upbeam.model.beams import beam_table
 from upbeam.model.geometry import (
     GeometryError,

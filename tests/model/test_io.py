@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from upbeam.model import io as cloud_io
 from upbeam.model.geometry import project, recover_rings, to_counts
 from upbeam.model.io import (

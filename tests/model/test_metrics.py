@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from upbeam.model.beams import uniform_beam_table
 from upbeam.model.metrics import chamfer_m2, compare_rows
 from upbeam.model.rules import Rules

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from upbeam.model.network import NetworkError, WindowNetwork, from_state_dict, load_state_dict
 
 VECTORS = Path(__file__).parents[1] / "vectors" / "window_network.npz"

@@ -6,6 +6,7 @@ from importlib import resources
 
 import pytest
 import yaml
+
 from upbeam.model.recipe import RecipeError, load_recipe, recipe_names
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from upbeam.model.beams import beam_table, uniform_beam_table
 from upbeam.model.network import FoldedNetwork
 from upbeam.model.rules import BEAMS, Rules, RulesError, extract_windows, upsample_reference

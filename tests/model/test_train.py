@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 import upbeam
 from upbeam.hw_sim import simulate_frames
 from upbeam.model.baselines import BASELINES

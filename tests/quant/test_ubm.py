@@ -7,6 +7,7 @@ import zlib
 
 import numpy as np
 import pytest
+
 from upbeam.model.beams import beam_table
 from upbeam.model.network import WindowNetwork
 from upbeam.model.rules import Rules

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from upbeam.model.beams import uniform_beam_table
 from upbeam.model.network import FoldedNetwork
 from upbeam.model.rules import BEAMS, Rules

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 import upbeam
 from upbeam.model.beams import beam_table
 from upbeam.model.frames import kitti_frames
