@@ -153,6 +153,8 @@ def _pack_netw(networks: tuple[FoldedNetwork, FoldedNetwork]) -> bytes:
     for network in networks:
         if not 1 <= network.hidden <= MAX_HIDDEN:
             raise UbmError(f"{network.hidden} hidden units, expected 1 to {MAX_HIDDEN}")
+        if network.skip not in (0.0, 1.0):
+            raise UbmError(f"skip {network.skip}, expected 0 or 1: the minimum is added as a whole number of counts")
         out += struct.pack("<IIff", network.hidden, int(network.positive), network.slope, network.skip)
         out += _floats(network.weight, network.bias, network.output_weight, [network.output_bias])
     return out
@@ -331,6 +333,8 @@ def _parse_netw(cursor: _Cursor) -> tuple[FoldedNetwork, FoldedNetwork]:
         if slope < 0:
             raise UbmError(f"section NETW: slope is {slope}, expected 0 to 1")
         skip = float(cursor.floats("skip", 1)[0])
+        if skip not in (0.0, 1.0):
+            raise UbmError(f"section NETW: skip is {skip}, expected 0 or 1")
         networks.append(
             FoldedNetwork(
                 weight=cursor.floats("A", hidden, 7),

@@ -3,6 +3,17 @@
 
 #include "upb_kernels.h"
 
+#ifndef UPB_FILL_KERNELS
+#define UPB_FILL_KERNELS upb_kernels_fill_c
+#endif
+
+/* Fused where that costs no call: then the bits are those of the vector kernels, which all fuse in the same order. */
+#if defined(FP_FAST_FMAF) || defined(__FMA__)
+#define FUSED(a, b, c) fmaf(a, b, c)
+#else
+#define FUSED(a, b, c) ((a) * (b) + (c))
+#endif
+
 static float pick_valid(const upb_model_f32 *model, uint16_t distance, float value) {
     return (float)distance >= model->min_count && (float)distance <= model->max_count ? value : 0.0f;
 }
@@ -59,17 +70,27 @@ static void gather(float x[UPB_TAPS], const upb_model_f32 *model, const upb_prep
         x[i] -= x[UPB_TAP_MINIMUM]; /* exact: whole numbers below 2^16 */
 }
 
+/* A network's output less skip * minimum. */
 static float network(const upb_network_f32 *net, const float x[UPB_TAPS]) {
     float y = net->offset;
     for (uint32_t h = 0; h < net->hidden; h++) {
         const float *unit = net->unit[h];
         float sum = unit[UPB_UNIT_BIAS];
         for (int i = 0; i < UPB_TAPS; i++)
-            sum += unit[i] * x[i];
+            sum = FUSED(unit[i], x[i], sum);
         float bent = net->slope * sum;
-        y += unit[UPB_UNIT_OUTPUT] * (sum > bent ? sum : bent);
+        y = FUSED(unit[UPB_UNIT_OUTPUT], sum > bent ? sum : bent, y);
     }
-    y += net->skip * x[UPB_TAP_MINIMUM]; /* last, for it is large: small terms added to it would each be rounded */
+    return y;
+}
+
+/* The whole output, rounded half up. The minimum is whole: adding it to the rounded rest is exact. */
+static float rounded_output(const upb_network_f32 *net, const float x[UPB_TAPS]) {
+    return floorf(network(net, x) + 0.5f) + net->skip * x[UPB_TAP_MINIMUM];
+}
+
+static float raw_output(const upb_network_f32 *net, const float x[UPB_TAPS]) {
+    float y = network(net, x) + net->skip * x[UPB_TAP_MINIMUM];
     return net->positive && y < 0.0f ? 0.0f : y;
 }
 
@@ -79,11 +100,11 @@ static void windows_f32_c(const upb_model_f32 *model, const upb_prepared_f32 *le
     for (unsigned k = 0; k < UPB_LANES; k++) {
         float x[UPB_TAPS];
         gather(x, model, column, UPB_DISTANCE_TOP, k);
-        float d = floorf(network(&model->network[UPB_DISTANCE], x) + 0.5f);
+        float d = rounded_output(&model->network[UPB_DISTANCE], x);
         int seen = !model->fill || x[UPB_TAP_MINIMUM] != 0.0f; /* filled: 0 only if the whole window is empty */
         int given = seen && d >= model->min_count && d <= model->max_count;
         gather(x, model, column, UPB_INTENSITY_TOP, k);
-        float i = floorf(network(&model->network[UPB_INTENSITY], x) + 0.5f);
+        float i = rounded_output(&model->network[UPB_INTENSITY], x);
         i = i < 0.0f ? 0.0f : i > 255.0f ? 255.0f : i; /* before the conversion: it may not fit an integer */
         distance[k] = given ? (uint16_t)d : 0;
         intensity[k] = given ? (uint8_t)i : 0;
@@ -96,13 +117,13 @@ static void raw_f32_c(const upb_model_f32 *model, const upb_prepared_f32 *left, 
     for (unsigned k = 0; k < UPB_LANES; k++) {
         float x[UPB_TAPS];
         gather(x, model, column, UPB_DISTANCE_TOP, k);
-        distance[k] = network(&model->network[UPB_DISTANCE], x);
+        distance[k] = raw_output(&model->network[UPB_DISTANCE], x);
         gather(x, model, column, UPB_INTENSITY_TOP, k);
-        intensity[k] = network(&model->network[UPB_INTENSITY], x);
+        intensity[k] = raw_output(&model->network[UPB_INTENSITY], x);
     }
 }
 
-void upb_kernels_fill_c(upb_kernels *kernels) {
+void UPB_FILL_KERNELS(upb_kernels *kernels) {
     kernels->prepare_f32 = prepare_f32_c;
     kernels->windows_f32 = windows_f32_c;
     kernels->raw_f32 = raw_f32_c;

@@ -75,6 +75,7 @@ static inline void gather(window *w, const upb_model_f32 *model, const upb_prepa
     }
 }
 
+/* A network's output less skip * minimum. */
 static inline void network(V *y, const upb_network_f32 *net, const window *w) {
     const V slope = V_SET(net->slope);
     for (unsigned b = 0; b < V_BLOCK; b++)
@@ -90,14 +91,17 @@ static inline void network(V *y, const upb_network_f32 *net, const window *w) {
         for (unsigned b = 0; b < V_BLOCK; b++)
             y[b] = V_FMA(V_SET(unit[UPB_UNIT_OUTPUT]), V_MAX(sum[b], V_MUL(slope, sum[b])), y[b]);
     }
-    for (unsigned b = 0; b < V_BLOCK; b++)
-        y[b] = V_FMA(V_SET(net->skip), w[b].x[UPB_TAP_MINIMUM], y[b]);
-    if (net->positive)
-        for (unsigned b = 0; b < V_BLOCK; b++)
-            y[b] = V_MAX(y[b], V_SET(0.0f));
 }
 
-static inline V round_half_up(V y) { return V_FLOOR(V_ADD(y, V_SET(0.5f))); }
+/* The whole output, rounded half up. The minimum is whole: adding it to the rounded rest is exact. */
+static inline V rounded_output(V rest, const upb_network_f32 *net, const window *w) {
+    return V_FMA(V_SET(net->skip), w->x[UPB_TAP_MINIMUM], V_FLOOR(V_ADD(rest, V_SET(0.5f))));
+}
+
+static inline V raw_output(V rest, const upb_network_f32 *net, const window *w) {
+    V y = V_FMA(V_SET(net->skip), w->x[UPB_TAP_MINIMUM], rest);
+    return net->positive ? V_MAX(y, V_SET(0.0f)) : y;
+}
 
 static void windows_f32(const upb_model_f32 *model, const upb_prepared_f32 *left, const upb_prepared_f32 *middle,
                         const upb_prepared_f32 *right, uint16_t *distance, uint8_t *intensity) {
@@ -110,7 +114,7 @@ static void windows_f32(const upb_model_f32 *model, const upb_prepared_f32 *left
         gather(w, model, column, UPB_DISTANCE_TOP, k);
         network(y, &model->network[UPB_DISTANCE], w);
         for (unsigned b = 0; b < V_BLOCK; b++) {
-            V d = round_half_up(y[b]);
+            V d = rounded_output(y[b], &model->network[UPB_DISTANCE], &w[b]);
             given[b] = M_BETWEEN(d, low, high);
             if (model->fill)
                 given[b] = M_AND_NOT(given[b], M_IS_ZERO(w[b].x[UPB_TAP_MINIMUM]));
@@ -119,7 +123,8 @@ static void windows_f32(const upb_model_f32 *model, const upb_prepared_f32 *left
         gather(w, model, column, UPB_INTENSITY_TOP, k);
         network(y, &model->network[UPB_INTENSITY], w);
         for (unsigned b = 0; b < V_BLOCK; b++) {
-            V i = V_MIN(V_MAX(round_half_up(y[b]), zero), V_SET(255.0f));
+            V i = rounded_output(y[b], &model->network[UPB_INTENSITY], &w[b]);
+            i = V_MIN(V_MAX(i, zero), V_SET(255.0f));
             V_STORE_U8(intensity + k + b * V_LANES, V_SELECT(given[b], i, zero));
         }
     }
@@ -134,11 +139,11 @@ static void raw_f32(const upb_model_f32 *model, const upb_prepared_f32 *left, co
         gather(w, model, column, UPB_DISTANCE_TOP, k);
         network(y, &model->network[UPB_DISTANCE], w);
         for (unsigned b = 0; b < V_BLOCK; b++)
-            V_STOREU(distance + k + b * V_LANES, y[b]);
+            V_STOREU(distance + k + b * V_LANES, raw_output(y[b], &model->network[UPB_DISTANCE], &w[b]));
         gather(w, model, column, UPB_INTENSITY_TOP, k);
         network(y, &model->network[UPB_INTENSITY], w);
         for (unsigned b = 0; b < V_BLOCK; b++)
-            V_STOREU(intensity + k + b * V_LANES, y[b]);
+            V_STOREU(intensity + k + b * V_LANES, raw_output(y[b], &model->network[UPB_INTENSITY], &w[b]));
     }
 }
 

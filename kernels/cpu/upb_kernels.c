@@ -1,7 +1,7 @@
 /* Chooses kernels from the features of the CPU. */
 #include "upb_kernels.h"
 
-#if defined(UPB_HAVE_AVX2) || defined(UPB_HAVE_AVX512)
+#if defined(UPB_HAVE_C_FMA) || defined(UPB_HAVE_AVX2) || defined(UPB_HAVE_AVX512)
 
 #include <cpuid.h>
 
@@ -37,6 +37,10 @@ static int fill(upb_kernels *kernels, upb_cpu cpu) {
     switch (cpu) {
     case UPB_CPU_SCALAR:
         upb_kernels_fill_c(kernels);
+#ifdef UPB_HAVE_C_FMA
+        if (machine_has(UPB_CPU_AVX2)) /* which includes FMA */
+            upb_kernels_fill_c_fma(kernels);
+#endif
         return 1;
 #ifdef UPB_HAVE_AVX2
     case UPB_CPU_AVX2:

@@ -91,6 +91,7 @@ upb_cpu upb_kernels_select(upb_kernels *kernels, upb_cpu cpu);
 
 /* Each in its own file, compiled with the flags of its instruction set: call only where the machine has it. */
 void upb_kernels_fill_c(upb_kernels *kernels);
+void upb_kernels_fill_c_fma(upb_kernels *kernels);
 void upb_kernels_fill_avx2(upb_kernels *kernels);
 void upb_kernels_fill_avx512(upb_kernels *kernels);
 void upb_kernels_fill_neon(upb_kernels *kernels);

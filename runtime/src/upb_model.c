@@ -266,6 +266,7 @@ static upb_status read_float(const reader *r, unsigned network, const char *fiel
 static upb_status read_head(const reader *r, unsigned network, size_t at, upb_network_f32 *net) {
     static const char hidden_name[2][16] = {"NETW[0].hidden", "NETW[1].hidden"};
     static const char flags_name[2][16] = {"NETW[0].flags", "NETW[1].flags"};
+    static const char skip_name[2][16] = {"NETW[0].skip", "NETW[1].skip"};
     static const char slope_name[2][16] = {"NETW[0].slope", "NETW[1].slope"};
     upb_status status;
     if ((status = ranged(r, hidden_name[network], at, 1, UPB_MAX_HIDDEN, &net->hidden)) != UPB_OK ||
@@ -274,7 +275,11 @@ static upb_status read_head(const reader *r, unsigned network, size_t at, upb_ne
         return status;
     if (!(net->slope >= 0.0f && net->slope <= 1.0f))
         return bad_value(r, slope_name[network], at + 8, u32_at(r, at + 8), 1);
-    return read_float(r, network, ".skip", at + 12, &net->skip);
+    if ((status = read_float(r, network, ".skip", at + 12, &net->skip)) != UPB_OK)
+        return status;
+    if (net->skip != 0.0f && net->skip != 1.0f)
+        return bad_value(r, skip_name[network], at + 12, u32_at(r, at + 12), 1);
+    return UPB_OK;
 }
 
 /* Reads the network at `*at`, which ends before `end`, and moves `*at` behind it. */

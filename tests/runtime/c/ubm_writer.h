@@ -161,7 +161,7 @@ static inline test_model random_model(random_source *random, uint32_t columns, u
         net->hidden = hidden;
         net->flags = (uint32_t)n;
         net->slope = 0.01f;
-        net->skip = 0.7f;
+        net->skip = 0.0f;
         net->c = random_signed(random);
         for (uint32_t h = 0; h < hidden; h++) {
             for (int i = 0; i < 7; i++)
