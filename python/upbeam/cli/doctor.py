@@ -45,6 +45,7 @@ def environment() -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "cpu_features": _cpu_flags(),
         "instruction_sets": _usable_sets(),
+        "opencl_devices": _opencl_devices(),
         "packages": {name: _version(name) for name in PACKAGES},
         "tools": {name: _tool(name) for name in TOOLS},
     }
@@ -60,6 +61,17 @@ def _usable_sets() -> list[str]:
             continue
         usable.append(name)
     return usable
+
+
+def _opencl_devices() -> list[str] | str:
+    try:
+        import pyopencl
+    except ImportError:
+        return "pyopencl is not installed (this version has no OpenCL backend)"
+    try:
+        return [f"{p.name}: {d.name}" for p in pyopencl.get_platforms() for d in p.get_devices()]
+    except pyopencl.Error as error:
+        return f"no OpenCL platform: {error}"
 
 
 def _self_test() -> str:
