@@ -20,21 +20,25 @@ using namespace nb::literals;
 
 std::string describe(upb_status status, const upb_error *error) {
     std::string text = upb_status_text(status);
-    if (error == nullptr || error->what[0] == '\0') return text;
+    if (error == nullptr || error->what[0] == '\0')
+        return text;
     text = std::string(error->what) + ": " + text;
     if (error->got != 0 || error->expected != 0)
         text += " (got " + std::to_string(error->got) + ", expected " + std::to_string(error->expected) + ")";
-    if (error->offset != 0) text += " at byte " + std::to_string(error->offset);
+    if (error->offset != 0)
+        text += " at byte " + std::to_string(error->offset);
     return text;
 }
 
 void check(upb_status status, const upb_error *error) {
-    if (status != UPB_OK) throw NativeError(describe(status, error));
+    if (status != UPB_OK)
+        throw NativeError(describe(status, error));
 }
 
 AlignedMemory::AlignedMemory(std::size_t bytes) : bytes_((bytes + UPB_ALIGN - 1) / UPB_ALIGN * UPB_ALIGN) {
     memory_.reset(std::aligned_alloc(UPB_ALIGN, bytes_));
-    if (!memory_) throw std::bad_alloc();
+    if (!memory_)
+        throw std::bad_alloc();
     std::memset(memory_.get(), 0, bytes_);
 }
 
@@ -57,11 +61,16 @@ using DistanceIn = nb::ndarray<const uint16_t, nb::ndim<2>, nb::c_contig, nb::de
 using IntensityIn = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 upb_cpu cpu_from_name(const std::string &name) {
-    if (name == "auto") return UPB_CPU_AUTO;
-    if (name == "scalar") return UPB_CPU_SCALAR;
-    if (name == "avx2") return UPB_CPU_AVX2;
-    if (name == "avx512") return UPB_CPU_AVX512;
-    if (name == "neon") return UPB_CPU_NEON;
+    if (name == "auto")
+        return UPB_CPU_AUTO;
+    if (name == "scalar")
+        return UPB_CPU_SCALAR;
+    if (name == "avx2")
+        return UPB_CPU_AVX2;
+    if (name == "avx512")
+        return UPB_CPU_AVX512;
+    if (name == "neon")
+        return UPB_CPU_NEON;
     throw NativeError("unknown instruction set '" + name + "', expected auto, scalar, avx2, avx512 or neon");
 }
 
@@ -71,7 +80,8 @@ const char *cpu_name(uint32_t cpu) {
 }
 
 // A [rows, width] array that owns `data`.
-template <typename T> nb::ndarray<T, nb::numpy, nb::ndim<2>, nb::c_contig> own(std::vector<T> *data, size_t rows, size_t width) {
+template <typename T>
+nb::ndarray<T, nb::numpy, nb::ndim<2>, nb::c_contig> own(std::vector<T> *data, size_t rows, size_t width) {
     nb::capsule owner(data, [](void *p) noexcept { delete static_cast<std::vector<T> *>(p); });
     return nb::ndarray<T, nb::numpy, nb::ndim<2>, nb::c_contig>(data->data(), {rows, width}, owner);
 }
@@ -84,8 +94,9 @@ void need_shape(const char *what, size_t rows, size_t columns, size_t want_rows,
 
 // A column stream. A mutex keeps two Python threads out of it while the GIL is released.
 class StreamHandle {
-public:
-    StreamHandle(const ModelHandle &model, const std::string &cpu, uint32_t columns, uint32_t distance_unit_um, bool any_sensor, bool aligned)
+  public:
+    StreamHandle(const ModelHandle &model, const std::string &cpu, uint32_t columns, uint32_t distance_unit_um,
+                 bool any_sensor, bool aligned)
         : memory_(bytes(model, config(cpu, columns, distance_unit_um, any_sensor, aligned))) {
         upb_error error = {};
         const upb_stream_config c = config(cpu, columns, distance_unit_um, any_sensor, aligned);
@@ -109,7 +120,8 @@ public:
             check(upb_stream_frame(stream_, distance.data(), columns_, intensity.data(), columns_, d->data(), columns_,
                                    i->data(), columns_, columns_, &n));
             check(upb_stream_frame_end(stream_, d->data() + n, columns_, i->data() + n, columns_, columns_ - n, &rest));
-            if (n + rest != columns_) throw NativeError("internal: an image came out incomplete");
+            if (n + rest != columns_)
+                throw NativeError("internal: an image came out incomplete");
         }
         return nb::make_tuple(d_out, i_out);
     }
@@ -125,9 +137,11 @@ public:
             std::lock_guard<std::mutex> lock(mutex_);
             Collecting collecting(*this, out);
             for (size_t k = 0; k < n; ++k) {
-                const upb_status status = upb_stream_push(stream_, static_cast<uint32_t>((column + k) % columns_),
-                                                          distance.data() + k * UPB_BEAMS, intensity.data() + k * UPB_BEAMS);
-                if (status != UPB_E_ORDER) check(status); // a late column is counted in the stats
+                const upb_status status =
+                    upb_stream_push(stream_, static_cast<uint32_t>((column + k) % columns_),
+                                    distance.data() + k * UPB_BEAMS, intensity.data() + k * UPB_BEAMS);
+                if (status != UPB_E_ORDER)
+                    check(status); // a late column is counted in the stats
             }
         }
         return columns(out);
@@ -169,7 +183,7 @@ public:
         return d;
     }
 
-private:
+  private:
     struct Collected {
         std::vector<uint16_t> distance; // [m][64]
         std::vector<uint8_t> intensity;
@@ -185,7 +199,8 @@ private:
 
     static void sink(void *user, const upb_column *column) {
         Collected *out = static_cast<StreamHandle *>(user)->collected_;
-        if (out == nullptr) return;
+        if (out == nullptr)
+            return;
         out->distance.insert(out->distance.end(), column->distance, column->distance + UPB_ROWS);
         out->intensity.insert(out->intensity.end(), column->intensity, column->intensity + UPB_ROWS);
         out->place.insert(out->place.end(), {column->frame, column->column, column->flags});
@@ -232,7 +247,8 @@ private:
     std::mutex mutex_;
 };
 
-nb::tuple raw_windows(const ModelHandle &model, const DistanceIn &distance, const IntensityIn &intensity, const std::string &cpu) {
+nb::tuple raw_windows(const ModelHandle &model, const DistanceIn &distance, const IntensityIn &intensity,
+                      const std::string &cpu) {
     const size_t n = distance.shape(0);
     need_shape("distance", n, distance.shape(1), n, UPB_BEAMS);
     need_shape("intensity", intensity.shape(0), intensity.shape(1), n, UPB_BEAMS);
@@ -240,8 +256,8 @@ nb::tuple raw_windows(const ModelHandle &model, const DistanceIn &distance, cons
     auto d_out = own(d, n, UPB_BEAMS);
     auto *i = new std::vector<float>(n * UPB_BEAMS);
     auto i_out = own(i, n, UPB_BEAMS);
-    check(upb_raw_windows(model.model(), cpu_from_name(cpu), static_cast<uint32_t>(n), distance.data(), intensity.data(),
-                          d->data(), i->data()));
+    check(upb_raw_windows(model.model(), cpu_from_name(cpu), static_cast<uint32_t>(n), distance.data(),
+                          intensity.data(), d->data(), i->data()));
     return nb::make_tuple(d_out, i_out);
 }
 
@@ -275,8 +291,9 @@ NB_MODULE(_native, m) {
         .def(nb::init<const nb::bytes &>(), "ubm"_a)
         .def("info", &info_dict);
     nb::class_<StreamHandle>(m, "Stream", "A column stream over a model.")
-        .def(nb::init<const ModelHandle &, const std::string &, uint32_t, uint32_t, bool, bool>(), "model"_a, "cpu"_a = "auto",
-             "columns"_a = 0, "distance_unit_um"_a = 0, "any_sensor"_a = false, "aligned"_a = false, nb::keep_alive<1, 2>())
+        .def(nb::init<const ModelHandle &, const std::string &, uint32_t, uint32_t, bool, bool>(), "model"_a,
+             "cpu"_a = "auto", "columns"_a = 0, "distance_unit_um"_a = 0, "any_sensor"_a = false, "aligned"_a = false,
+             nb::keep_alive<1, 2>())
         .def("image", &StreamHandle::image, "distance"_a, "intensity"_a)
         .def("push", &StreamHandle::push, "distance"_a, "intensity"_a, "column"_a)
         .def("gap", &StreamHandle::gap, "columns"_a)
@@ -284,7 +301,8 @@ NB_MODULE(_native, m) {
         .def("reset", &StreamHandle::reset)
         .def("stats", &StreamHandle::stats);
     m.def("raw_windows", &raw_windows, "model"_a, "distance"_a, "intensity"_a, "cpu"_a = "auto",
-          "Outputs of both networks before rounding and validity for aligned columns [n, 32]: counts and intensities [n, 32], "
+          "Outputs of both networks before rounding and validity for aligned columns [n, 32]: counts and intensities "
+          "[n, 32], "
           "of each column the last without meaning. Both ends are edges.");
     bind_live(m);
 }

@@ -14,7 +14,7 @@ void bind_live(nanobind::module_ &m);
 
 // Becomes Python's upbeam.runtime.NativeError (a ValueError).
 class NativeError : public std::runtime_error {
-public:
+  public:
     using std::runtime_error::runtime_error;
 };
 
@@ -24,12 +24,12 @@ void check(upb_status status, const upb_error *error = nullptr);
 
 // Memory aligned to UPB_ALIGN, zeroed.
 class AlignedMemory {
-public:
+  public:
     explicit AlignedMemory(std::size_t bytes);
     void *get() const { return memory_.get(); }
     std::size_t bytes() const { return bytes_; }
 
-private:
+  private:
     struct Free {
         void operator()(void *p) const;
     };
@@ -39,12 +39,12 @@ private:
 
 // A loaded model. Immutable: any number of streams may use it at once.
 class ModelHandle {
-public:
+  public:
     explicit ModelHandle(const nanobind::bytes &ubm);
     upb_model *model() const { return model_; }
     upb_model_info info() const;
 
-private:
+  private:
     AlignedMemory memory_;
     upb_model *model_ = nullptr;
 };

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from upbeam.model.baselines import BASELINES, bilinear, nearest, valid_mean
+from upbeam.model.baselines import BASELINES, bilinear, nearest, valid_mean, window_mean
 from upbeam.model.beams import uniform_beam_table
 from upbeam.model.rules import Rules
 
@@ -18,12 +18,14 @@ def image(rng, empty=0.3):
     return distance, rng.integers(0, 256, distance.shape).astype(np.uint8)
 
 
-def test_valid_mean_loop(rng):
+@pytest.mark.parametrize(("method", "reach"), [(valid_mean, 0), (window_mean, 1)])
+def test_means_of_valid_pixels_against_a_loop(rng, method, reach):
     distance, intensity = image(rng)
-    d, i = valid_mean(distance, intensity, RULES)
+    d, i = method(distance, intensity, RULES)
     for row in range(31):
         for column in range(16):
-            cells = [(r, c) for r in (row, row + 1) for c in (column - 1, column, column + 1) if 0 <= c < 16]
+            around = range(max(0, column - reach), min(16, column + reach + 1))
+            cells = [(r, c) for r in (row, row + 1) for c in around]
             seen = [(int(distance[x]), int(intensity[x])) for x in cells if distance[x]]
             mean = [int(np.floor(np.mean(v) + 0.5)) for v in zip(*seen, strict=True)] if seen else [0, 0]
             assert [d[row, column], i[row, column]] == mean

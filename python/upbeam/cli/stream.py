@@ -165,14 +165,14 @@ def _play(feed: _Feed, model: Model, config: LiveConfig, *, quiet: bool) -> Live
     config = replace(config, aligned=feed.aligned, keep_frames=(feed.pictured,))
     columns = firing_columns(feed.images[0]), firing_columns(feed.images[1])
     total = config.frames or len(columns[0])
-    with progress_bar(f"streaming at {config.rate_hz:g} Hz ({config.clock} clock)", total, quiet=quiet) as advance:
+    with progress_bar(f"streaming {config.rate_hz:g} Hz", total, quiet=quiet) as advance:
         done = 0
 
         def show_progress(p: LiveProgress) -> None:
             nonlocal done
             advance(
                 p.frames - done,
-                f"latency {p.last_latency_ms:.3f} ms, worst {p.max_latency_ms:.3f} ms, misses {p.misses}",
+                f"{p.last_latency_ms:.2f} ms, worst {p.max_latency_ms:.2f}, misses {p.misses}",
             )
             done = p.frames
 
