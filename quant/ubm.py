@@ -36,7 +36,7 @@ _LAST_ROWS = ("repeat", "empty")
 _EMPTY = ("none", "fill")
 _INPUTS = ("raw", "difference")
 _OUTPUTS = ("raw", "residual")
-_SENS_BYTES = 64 + 4 * ROWS + 4 * BEAMS + 4 * ROWS
+_SENS_BYTES = 64 + 4 * ROWS + 4 * BEAMS + 4 * ROWS + 2 * ROWS
 
 
 class UbmError(ValueError):
@@ -145,7 +145,8 @@ def _pack_sens(rules: Rules) -> bytes:
         _EMPTY.index(rules.empty),
     )
     millionths = np.concatenate([rules.row_elevation_deg, rules.azimuth_offset_deg, rules.row_height_m])
-    return head + np.round(millionths * 1e6).astype("<i4").tobytes()
+    limits = rules.row_max_count.astype("<u2").tobytes()
+    return head + np.round(millionths * 1e6).astype("<i4").tobytes() + limits
 
 
 def _pack_netw(networks: tuple[FoldedNetwork, FoldedNetwork]) -> bytes:
@@ -292,7 +293,7 @@ def _parse_sens(data: bytes) -> Rules:
         raise UbmError("section SENS: reserved bytes are not 0")
     if edge > 1 or last_row > 1 or empty > 1:
         raise UbmError(f"section SENS: unknown rule (edge {edge}, last row {last_row}, empty {empty}), expected 0 or 1")
-    millionths = np.frombuffer(data, dtype="<i4", offset=64).astype(np.float64) / 1e6
+    millionths = np.frombuffer(data, dtype="<i4", offset=64, count=ROWS + BEAMS + ROWS).astype(np.float64) / 1e6
     for key, values, limit in (
         ("row elevation", millionths[:ROWS], 90),
         ("azimuth_offset", millionths[ROWS : ROWS + BEAMS], 45),
@@ -307,6 +308,7 @@ def _parse_sens(data: bytes) -> Rules:
         row_elevation_deg=millionths[:ROWS],
         azimuth_offset_deg=millionths[ROWS : ROWS + BEAMS],
         row_height_m=millionths[ROWS + BEAMS :],
+        row_max_count=np.frombuffer(data, dtype="<u2", offset=_SENS_BYTES - 2 * ROWS).astype(np.int64),
         min_count=low,
         max_count=high,
         cut_deg=cut / 1000.0,

@@ -14,16 +14,16 @@
 #define FUSED(a, b, c) ((a) * (b) + (c))
 #endif
 
-static float pick_valid(const upb_model_f32 *model, uint16_t distance, float value) {
-    return (float)distance >= model->min_count && (float)distance <= model->max_count ? value : 0.0f;
+static float pick_valid(const upb_model_f32 *model, unsigned beam, uint16_t distance, float value) {
+    return (float)distance >= model->min_count && (float)distance <= model->seen_max[beam] ? value : 0.0f;
 }
 
 static void prepare_f32_c(upb_prepared_f32 *prepared, const upb_model_f32 *model, const uint16_t *distance,
                           const uint8_t *intensity) {
     float d[UPB_LANES + 1], i[UPB_LANES + 1];
     for (unsigned k = 0; k < UPB_LANES; k++) {
-        d[k] = pick_valid(model, distance[k], (float)distance[k]);
-        i[k] = pick_valid(model, distance[k], (float)intensity[k]);
+        d[k] = pick_valid(model, k, distance[k], (float)distance[k]);
+        i[k] = pick_valid(model, k, distance[k], (float)intensity[k]);
     }
     d[UPB_LANES] = i[UPB_LANES] = 0.0f;
     for (unsigned k = 0; k < UPB_LANES; k++) {
@@ -102,7 +102,7 @@ static void windows_f32_c(const upb_model_f32 *model, const upb_prepared_f32 *le
         gather(x, model, column, UPB_DISTANCE_TOP, k);
         float d = rounded_output(&model->network[UPB_DISTANCE], x);
         int seen = !model->fill || x[UPB_TAP_MINIMUM] != 0.0f; /* filled: 0 only if the whole window is empty */
-        int given = seen && d >= model->min_count && d <= model->max_count;
+        int given = seen && d >= model->min_count && d <= model->given_max[k];
         gather(x, model, column, UPB_INTENSITY_TOP, k);
         float i = rounded_output(&model->network[UPB_INTENSITY], x);
         i = i < 0.0f ? 0.0f : i > 255.0f ? 255.0f : i; /* before the conversion: it may not fit an integer */

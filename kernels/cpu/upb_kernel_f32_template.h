@@ -23,10 +23,10 @@ typedef struct window {
 static void prepare_f32(upb_prepared_f32 *prepared, const upb_model_f32 *model, const uint16_t *distance,
                         const uint8_t *intensity) {
     _Alignas(UPB_ALIGN) float d[UPB_LANES + V_LANES], i[UPB_LANES + V_LANES];
-    const V low = V_SET(model->min_count), high = V_SET(model->max_count), zero = V_SET(0.0f);
+    const V low = V_SET(model->min_count), zero = V_SET(0.0f);
     for (unsigned k = 0; k < UPB_LANES; k += V_LANES) {
         V count = V_LOAD_U16(distance + k);
-        M valid = M_BETWEEN(count, low, high);
+        M valid = M_BETWEEN(count, low, V_LOAD(model->seen_max + k));
         V_STORE(d + k, V_SELECT(valid, count, zero));
         V_STORE(i + k, V_SELECT(valid, V_LOAD_U8(intensity + k), zero));
     }
@@ -106,7 +106,7 @@ static inline V raw_output(V rest, const upb_network_f32 *net, const window *w) 
 static void windows_f32(const upb_model_f32 *model, const upb_prepared_f32 *left, const upb_prepared_f32 *middle,
                         const upb_prepared_f32 *right, uint16_t *distance, uint8_t *intensity) {
     const upb_prepared_f32 *const column[3] = {left, middle, right};
-    const V low = V_SET(model->min_count), high = V_SET(model->max_count), zero = V_SET(0.0f);
+    const V low = V_SET(model->min_count), zero = V_SET(0.0f);
     for (unsigned k = 0; k < UPB_LANES; k += V_BLOCK * V_LANES) {
         window w[V_BLOCK];
         V y[V_BLOCK];
@@ -115,7 +115,7 @@ static void windows_f32(const upb_model_f32 *model, const upb_prepared_f32 *left
         network(y, &model->network[UPB_DISTANCE], w);
         for (unsigned b = 0; b < V_BLOCK; b++) {
             V d = rounded_output(y[b], &model->network[UPB_DISTANCE], &w[b]);
-            given[b] = M_BETWEEN(d, low, high);
+            given[b] = M_BETWEEN(d, low, V_LOAD(model->given_max + k + b * V_LANES));
             if (model->fill)
                 given[b] = M_AND_NOT(given[b], M_IS_ZERO(w[b].x[UPB_TAP_MINIMUM]));
             V_STORE_U16(distance + k + b * V_LANES, V_SELECT(given[b], d, zero));

@@ -41,10 +41,11 @@ enum { UPB_DISTANCE = 0, UPB_INTENSITY = 1 };
 
 /* What a kernel needs of a model. */
 typedef struct upb_model_f32 {
-    upb_network_f32 network[2]; /* UPB_DISTANCE, UPB_INTENSITY */
-    float min_count;            /* 1..max_count, whole: nearest count that is seen and given */
-    float max_count;            /* at most 65535 */
-    uint32_t fill;              /* not 0: UPB_EMPTY_FILL */
+    upb_network_f32 network[2];                     /* UPB_DISTANCE, UPB_INTENSITY */
+    _Alignas(UPB_ALIGN) float seen_max[UPB_LANES];  /* farthest count seen of each beam, whole, min_count..65535 */
+    _Alignas(UPB_ALIGN) float given_max[UPB_LANES]; /* farthest count given by each window; the last lane is padding */
+    float min_count;                                /* at least 1, whole: nearest count that is seen and given */
+    uint32_t fill;                                  /* not 0: UPB_EMPTY_FILL */
 } upb_model_f32;
 
 /* Rows of a prepared column. Top is beam k, bottom beam k+1. */
@@ -53,7 +54,7 @@ enum { UPB_DISTANCE_TOP, UPB_DISTANCE_BOTTOM, UPB_INTENSITY_TOP, UPB_INTENSITY_B
 /*
  * A column as windows see it: range limits applied (a pixel outside is 0, distance and intensity), and under
  * UPB_EMPTY_FILL an empty pixel filled from the other one of its pair. Three of them side by side make the windows.
- * Distances are 0 (empty) or min_count..max_count, intensities 0..255, all whole.
+ * Distances are 0 (empty) or min_count..65535, intensities 0..255, all whole.
  */
 typedef struct upb_prepared_f32 {
     _Alignas(UPB_ALIGN) float row[UPB_PREPARED_ROWS][UPB_LANES];
@@ -65,7 +66,7 @@ typedef void (*upb_prepare_f32_fn)(upb_prepared_f32 *prepared, const upb_model_f
 
 /*
  * Both networks on the 31 windows around `middle`. Writes UPB_LANES values to both outputs (no alignment needed):
- * distance 0 or min_count..max_count, intensity 0..255 and 0 where the distance is 0. The three columns may be one and
+ * distance 0 or min_count..given_max, intensity 0..255 and 0 where the distance is 0. The three columns may be one and
  * the same.
  */
 typedef void (*upb_windows_f32_fn)(const upb_model_f32 *model, const upb_prepared_f32 *left,

@@ -9,7 +9,7 @@ enum {
     CRC_BYTES = 4,
     FILE_BYTES_MAX = 1 << 20,
     SECTIONS_MAX = 32,
-    SENS_BYTES = 704,
+    SENS_BYTES = 832,
     NETWORK_HEAD_BYTES = 16,
     UNIT_NUMBERS = UPB_TAPS + 2 /* weights, b and v of a hidden unit */
 };
@@ -231,6 +231,17 @@ static upb_status read_geometry(const reader *r, size_t at, upb_model_info *info
     return status;
 }
 
+static upb_status read_row_limits(const reader *r, size_t at, upb_model_info *info) {
+    for (unsigned row = 0; row < UPB_ROWS; row++) {
+        const uint32_t most = u16_at(r, at + 2 * row);
+        if (most < info->min_count || most > info->max_count)
+            return bad_element(r, "SENS.row_max_count", row, at + 2 * row, most,
+                               most < info->min_count ? info->min_count : info->max_count);
+        info->row_max_count[row] = (uint16_t)most;
+    }
+    return UPB_OK;
+}
+
 static upb_status read_sensor(const reader *r, const section *s, upb_model_info *info) {
     const size_t at = s->offset;
     uint32_t beams;
@@ -246,7 +257,9 @@ static upb_status read_sensor(const reader *r, const section *s, upb_model_info 
         (status = ranged(r, "SENS.min_count", at + 48, 1, info->max_count, &info->min_count)) != UPB_OK ||
         (status = read_rules(r, at + 56, info)) != UPB_OK)
         return status;
-    return read_geometry(r, at + 64, info);
+    if ((status = read_geometry(r, at + 64, info)) != UPB_OK)
+        return status;
+    return read_row_limits(r, at + 704, info);
 }
 
 /* ------------------------------------------------------------------------------------------------ NETW */
@@ -372,7 +385,10 @@ static upb_status read_file(const reader *r, upb_model *model) {
     for (int n = 0; n < 2; n++)
         model->info.hidden[n] = model->f32.network[n].hidden;
     model->f32.min_count = (float)model->info.min_count;
-    model->f32.max_count = (float)model->info.max_count;
+    for (unsigned k = 0; k < UPB_LANES; k++) {
+        model->f32.seen_max[k] = (float)model->info.row_max_count[2 * k];
+        model->f32.given_max[k] = (float)model->info.row_max_count[2 * k + 1];
+    }
     model->f32.fill = model->info.empty_rule == UPB_EMPTY_FILL;
     return UPB_OK;
 }

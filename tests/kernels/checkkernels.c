@@ -71,7 +71,13 @@ static void random_model_f32(random_source *random, upb_model_f32 *model, uint32
                    20.0f * wild);
     const uint32_t low = 1 + random_below(random, 3000), high = low + random_below(random, 65536 - low);
     model->min_count = (float)low;
-    model->max_count = (float)high;
+    for (unsigned k = 0; k < UPB_LANES; k++) {
+        model->seen_max[k] =
+            random_below(random, 2) ? (float)high : (float)(low + random_below(random, high - low + 1));
+        model->given_max[k] =
+            random_below(random, 2) ? (float)high : (float)(low + random_below(random, high - low + 1));
+    }
+    model->seen_max[31] = (float)high;
     model->fill = random_below(random, 2);
 }
 
@@ -81,7 +87,7 @@ enum { SCENE = 0, ALL_MAX = 4, ALL_EQUAL = 7, PATTERNS = sizeof patterns / sizeo
 
 static uint16_t pattern_distance(random_source *random, unsigned pattern, const upb_model_f32 *model, unsigned k,
                                  unsigned chosen) {
-    const uint32_t low = (uint32_t)model->min_count, high = (uint32_t)model->max_count;
+    const uint32_t low = (uint32_t)model->min_count, high = (uint32_t)model->seen_max[31];
     const uint16_t within = (uint16_t)(low + random_below(random, high - low + 1));
     switch (pattern) {
     case SCENE: /* smooth surfaces some steps apart, a return in ten missing */
@@ -158,7 +164,7 @@ static void complain(const parameters *p, const char *what, unsigned k, double g
     fprintf(stderr, "    %s, lane %u: got %.9g, expected %.9g\n", what, k, got, expected);
     fprintf(stderr, "    kernel %s, --seed %lu, round %u, columns %s, hidden %u and %u, limits %g..%g, fill %u\n",
             p->cpu_name, p->seed, p->round, p->pattern, p->model->network[0].hidden, p->model->network[1].hidden,
-            (double)p->model->min_count, (double)p->model->max_count, p->model->fill);
+            (double)p->model->min_count, (double)p->model->seen_max[31], p->model->fill);
 }
 
 /* Is an integer + 1/2, where floor(y + 0.5) jumps, within the tolerance of y? */
@@ -267,7 +273,8 @@ static void check_by_hand(const upb_kernels *kernels) {
         model.network[n].unit[0][UPB_UNIT_OUTPUT] = 1.0f;
     }
     model.min_count = 2;
-    model.max_count = 60000;
+    for (unsigned k = 0; k < UPB_LANES; k++)
+        model.seen_max[k] = model.given_max[k] = 60000;
     model.fill = 1;
     const float weights[UPB_TAPS] = {1, 10, 100, 1000, 10000, 0, 11111}; /* of differences: pixels count 1..10000 */
     memcpy(model.network[0].unit[0], weights, sizeof weights);

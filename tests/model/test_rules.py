@@ -27,7 +27,7 @@ def window_by_hand(distance, intensity, rules, row, column):
     def pixel(r, c):
         inside = 0 <= c < distance.shape[1]
         d = int(distance[r, c]) if inside else 0
-        return (d, int(intensity[r, c])) if inside and rules.min_count <= d <= rules.max_count else (0, 0)
+        return (d, int(intensity[r, c])) if inside and rules.min_count <= d <= rules.row_max_count[2 * r] else (0, 0)
 
     columns = []
     for c in (column - 1, column, column + 1):
@@ -87,7 +87,7 @@ def test_sensor_rows_leave_verbatim_also_beyond_the_limits(rng):
 def test_rounding_limits_and_the_all_empty_window(rng):
     distance, intensity = random_image(rng, empty=0.0)
     distance[:, 8:] = 0
-    rules = make_rules()
+    rules = make_rules(ground_reach=0.0)
     near = upsample_reference(distance, intensity, (constant_network(2.9985), constant_network(7.5)), rules)
     assert set(near[0][1:-1:2, :8].ravel()) == {0}  # 2.9985 m -> 1499.25 -> 1499 < 1500 counts
     kept = upsample_reference(distance, intensity, (constant_network(2.9991), constant_network(7.5)), rules)
@@ -107,6 +107,30 @@ def test_last_row(rng, rule, expected):
     )
     assert np.array_equal(out[63], distance[31] if expected == "row 62" else np.zeros(16))
     assert np.array_equal(grey[63], intensity[31] if expected == "row 62" else np.zeros(16))
+
+
+def test_rows_that_point_down_have_limits_of_their_own(rng):
+    """Four times the way to flat ground: beyond it the networks see nothing and nothing is generated."""
+    rules = make_rules(ground_reach=4.0, sensor_height_m=2.0)
+    assert rules.row_max_count[0] == rules.max_count  # points up
+    assert rules.row_max_count[63] == int(4 * 2.0 / np.sin(np.radians(24.0)) / 0.002)
+    assert make_rules(ground_reach=0.0).row_max_count.tolist() == [40_000] * 64
+    distance, intensity = random_image(rng, empty=0.0)
+    distance[:] = 12_000  # 24 m: beyond the limit of the lowest rows, 8.0 m / sin(19.5 degrees)
+    out, _ = upsample_reference(distance, intensity, (constant_network(24.0), constant_network(5.0)), rules)
+    limited = rules.row_max_count[1:-1:2] < 12_000
+    assert limited.sum() == 5
+    assert set(out[1:-1:2][limited].ravel()) == {0}
+    assert set(out[1:-1:2][~limited].ravel()) == {12_000}
+    assert np.array_equal(out[::2], distance)
+    far_only = extract_windows(distance, intensity, rules)
+    assert not far_only.any_return[-1].any()
+
+
+@pytest.mark.parametrize("reach", [-1.0, np.nan])
+def test_an_impossible_reach_is_refused(reach):
+    with pytest.raises(RulesError, match="ground_reach"):
+        make_rules(ground_reach=reach)
 
 
 def test_rules_of_beam_tables():

@@ -131,6 +131,8 @@ def test_unknown_sections(model):
         (64, "<i:-25000000", "fall strictly", "elevation"),
         (320, "<i:45000001", "azimuth_offset", "azimuth_offset"),
         (448, "<i:10000001", "row_height", "row_height"),
+        (704, "<H:749", "row_max_count", "row_max_count"),
+        (830, "<H:65535", "row_max_count", "row_max_count"),
     ],
 )
 def test_impossible_values_of_the_sensor_are_named(model, offset, value, python, native):

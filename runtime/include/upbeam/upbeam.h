@@ -120,6 +120,7 @@ typedef struct upb_model_info {
     int32_t row_elevation_udeg[UPB_ROWS];   /* millionths of a degree above the horizon */
     int32_t azimuth_offset_udeg[UPB_BEAMS]; /* clockwise from the firing's azimuth to the beam's */
     int32_t row_height_um[UPB_ROWS];        /* height of the row's laser origin over the sensor's, micrometres */
+    uint16_t row_max_count[UPB_ROWS];       /* farthest count seen (even rows) or given (odd rows) */
 } upb_model_info;
 
 /* Bytes of memory a model needs. */

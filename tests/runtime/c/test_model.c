@@ -257,7 +257,7 @@ typedef struct wrong_field {
     const char *what;
 } wrong_field;
 
-enum { SENS = 64, NETW = SENS + 704, NETW_1 = NETW + 4 + 16 + 12 * 36 + 4 };
+enum { SENS = 64, NETW = SENS + 832, NETW_1 = NETW + 4 + 16 + 12 * 36 + 4 };
 
 static const wrong_field wrong_fields[] = {
     {0, 4, 0x4d425056, UPB_E_MAGIC, "magic"},
@@ -271,9 +271,9 @@ static const wrong_field wrong_fields[] = {
     {32 + 8, 4, SENS - 8, UPB_E_SECTION, "SENS"},    /* in the table */
     {32 + 8, 4, 1 << 20, UPB_E_SECTION, "SENS"},     /* outside the file */
     {32 + 12, 4, 0xfffffff8, UPB_E_SECTION, "SENS"}, /* offset + bytes overflows */
-    {48 + 8, 4, SENS + 696, UPB_E_SECTION, "NETW"},  /* overlaps */
+    {48 + 8, 4, SENS + 824, UPB_E_SECTION, "NETW"},  /* overlaps */
     {48 + 12, 4, 0x7fffffff, UPB_E_SECTION, "NETW"},
-    {32 + 12, 4, 696, UPB_E_VALUE, "gap"}, /* what is left over is not 0 */
+    {32 + 12, 4, 824, UPB_E_VALUE, "gap"}, /* what is left over is not 0 */
     {SENS + 0, 1, 7, UPB_E_VALUE, "SENS.name[0]"},
     {SENS + 20, 1, 'x', UPB_E_VALUE, "SENS.name[20]"}, /* behind the end */
     {SENS + 32, 4, 31, UPB_E_VALUE, "SENS.beams"},
@@ -296,6 +296,8 @@ static const wrong_field wrong_fields[] = {
     {SENS + 444, 4, (uint32_t)-45000001, UPB_E_VALUE, "SENS.azimuth_offset[31]"},
     {SENS + 448, 4, 10000001, UPB_E_VALUE, "SENS.row_height[0]"},
     {SENS + 700, 4, (uint32_t)-10000001, UPB_E_VALUE, "SENS.row_height[63]"},
+    {SENS + 704, 2, 40001, UPB_E_VALUE, "SENS.row_max_count[0]"},
+    {SENS + 830, 2, 1, UPB_E_VALUE, "SENS.row_max_count[63]"},
     {NETW, 4, 1, UPB_E_VALUE, "NETW.count"},
     {NETW + 4, 4, 0, UPB_E_VALUE, "NETW[0].hidden"},
     {NETW + 4, 4, 33, UPB_E_VALUE, "NETW[0].hidden"},

@@ -85,7 +85,7 @@ static int pixel(const segment *s, int64_t from, int64_t n, unsigned k, double v
     if (s->model->edge == UPB_EDGE_ZERO && absolute(s, n) / s->columns != absolute(s, from) / s->columns)
         return 0;
     const firing *f = sample(s, n, k);
-    if (!f || f->distance[k] < s->model->min_count || f->distance[k] > s->model->max_count)
+    if (!f || f->distance[k] < s->model->min_count || f->distance[k] > s->model->row_max[2 * k])
         return 0;
     value[0] = f->distance[k];
     value[1] = f->intensity[k];
@@ -158,7 +158,7 @@ static void check_generated(const segment *s, const finished *out, int64_t n, un
         return;
     }
     const double d = plain_network(&m->network[0], x, 0, m->unit_um * 1e-6), i = plain_network(&m->network[1], x, 1, 1);
-    if (!CHECK(rounds_to(distance, d, 0.05, m->min_count, m->max_count, 0, 0)))
+    if (!CHECK(rounds_to(distance, d, 0.05, m->min_count, m->row_max[2 * k + 1], 0, 0)))
         fprintf(stderr, "    frame %llu column %u window %u: distance %u, expected about %.3f\n",
                 (unsigned long long)out->frame, out->column, k, distance, d);
     if (distance == 0)

@@ -22,6 +22,7 @@ typedef struct test_model {
     uint32_t columns, unit_um, cut_mdeg, min_count, max_count;
     uint8_t edge, last_row, empty_rule;
     int32_t elevation[UPB_ROWS], offset[UPB_BEAMS], height[UPB_ROWS];
+    uint16_t row_max[UPB_ROWS];
     test_network network[2];
 } test_model;
 
@@ -88,7 +89,9 @@ static inline size_t write_sens(uint8_t *at, const test_model *m) {
         put_u32(at + 320 + 4 * i, (uint32_t)m->offset[i]);
     for (int i = 0; i < 64; i++)
         put_u32(at + 448 + 4 * i, (uint32_t)m->height[i]);
-    return 704;
+    for (int i = 0; i < 64; i += 2)
+        put_u32(at + 704 + 2 * i, m->row_max[i] | (uint32_t)m->row_max[i + 1] << 16);
+    return 832;
 }
 
 static inline size_t write_netw(uint8_t *start, const test_model *m) {
@@ -155,7 +158,8 @@ static inline test_model random_model(random_source *random, uint32_t columns, u
     m.last_row = UPB_LAST_ROW_EMPTY;
     m.empty_rule = UPB_EMPTY_FILL;
     for (int i = 0; i < 64; i++)
-        m.elevation[i] = 10000000 - 600000 * i, m.height[i] = 1000 * (32 - i);
+        m.elevation[i] = 10000000 - 600000 * i, m.height[i] = 1000 * (32 - i),
+        m.row_max[i] = (uint16_t)(random_below(random, 3) ? 40000 : 1500 + random_below(random, 38501));
     for (int n = 0; n < 2; n++) {
         test_network *net = &m.network[n];
         net->hidden = hidden;
