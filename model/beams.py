@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -97,6 +98,16 @@ class BeamTable:
         """The same beams after destaggering: all lasers of a column share its azimuth."""
         return replace(self, azimuth_offset_deg=np.zeros(self.beams))
 
+    def doubled(self) -> BeamTable:
+        """A table with a virtual beam half way below each: what a sensor of twice the beams would see, to train on.
+
+        A virtual beam fires with the beam above it."""
+        repeated: dict[str, Any] = {key: np.repeat(getattr(self, key), 2) for key in _PER_BEAM}
+        repeated["elevation_deg"] = between_rows(self.elevation_deg)
+        repeated["vertical_offset_m"] = between_rows(self.vertical_offset_m)
+        repeated["laser_id"] = np.arange(2 * self.beams, dtype=np.float64)
+        return replace(self, name=f"{self.name}*2", **repeated)
+
     def with_columns(self, columns: int) -> BeamTable:
         return replace(self, columns=columns)
 
@@ -146,8 +157,7 @@ def beam_table_names() -> list[str]:
 
 
 def beam_table(name: str | Path) -> BeamTable:
-    """A shipped table by name (``hdl-64e``, ``hdl-64e/2``: every other beam, ``hdl-32e``, ``vlp-32c``) or a YAML
-    file."""
+    """A shipped table by name (see ``beam_table_names``), with ``*2`` its doubled form, or a YAML file."""
     path = Path(name)
     if path.suffix in {".yaml", ".yml"}:
         try:
@@ -155,6 +165,8 @@ def beam_table(name: str | Path) -> BeamTable:
         except OSError as error:
             raise BeamTableError(f"beam table {path}: {error.strerror}") from None
         return _parse(text, str(path))
+    if str(name).endswith("*2"):
+        return beam_table(str(name).removesuffix("*2")).doubled()
     if str(name) == "hdl-64e/2":
         return beam_table("hdl-64e").rows(slice(0, None, 2), "hdl-64e/2")
     if str(name) not in beam_table_names():

@@ -14,21 +14,65 @@ from .geometry import GeometryError, IndexArray, RangeImage, bin_elevation, elev
 from .io import Cloud, CloudError, read_cloud
 from .rules import ROWS, Rules
 
-__all__ = ["Frame", "RowRule", "image_of_cloud", "kitti_files", "kitti_frames"]
+__all__ = ["Frame", "RowRule", "bin_elevation_deg", "image_of_cloud", "kitti_files", "kitti_frames"]
 
 RowRule = Literal["ring", "elevation"]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A range image with the truth in it, azimuth aligned."""
+    """A range image with the truth in it, azimuth aligned, of any sensor: R rows, top first, R >= 3.
+
+    Even rows are the input; the truth are the odd rows that lie between two of them. Of an even R the last row is
+    never judged.
+    """
 
     name: str
     distance: NDArray[np.uint16]
-    """[64, W] counts, 0 = no return"""
+    """[R, W] counts, 0 = no return"""
     intensity: NDArray[np.uint8]
-    """[64, W]"""
+    """[R, W]"""
     distance_unit_m: float
+    elevation_deg: NDArray[np.float64]
+    """[R], above the horizon"""
+    row_height_m: NDArray[np.float64]
+    """[R] height of each row's laser origin over the sensor's"""
+    cut_deg: float = 180.0
+    """azimuth at which column 0 begins"""
+    surface: NDArray[np.uint8] | None = None
+    """[R, W] what each return came from, where that is known: the simulator's labels, 0 = no return"""
+
+    def __post_init__(self) -> None:
+        shape = self.distance.shape
+        if len(shape) != 2 or shape[0] < 3 or self.intensity.shape != shape:
+            raise GeometryError(
+                f"frame {self.name}: distance {list(shape)} and intensity {list(self.intensity.shape)}, "
+                "expected equal shapes [rows, columns] of 3 rows or more"
+            )
+        for name in ("elevation_deg", "row_height_m"):
+            if np.shape(getattr(self, name)) != (shape[0],):
+                raise GeometryError(f"frame {self.name}: {name} must be {shape[0]} numbers, one a row")
+        if self.surface is not None and self.surface.shape != shape:
+            raise GeometryError(f"frame {self.name}: surface {list(self.surface.shape)}, expected {list(shape)}")
+
+    @property
+    def rows(self) -> int:
+        return int(self.distance.shape[0])
+
+    @property
+    def truth(self) -> slice:
+        """The rows that are judged: odd ones between two even ones."""
+        return slice(1, self.rows - 1 if self.rows % 2 == 0 else self.rows, 2)
+
+    @property
+    def given(self) -> slice:
+        """The rows that methods see."""
+        return slice(0, None, 2)
+
+
+def bin_elevation_deg(top_deg: float = 2.0, bottom_deg: float = -24.9, rows: int = ROWS) -> NDArray[np.float64]:
+    """Middles of the rows of ``geometry.bin_elevation``, ``float64[rows]``."""
+    return top_deg - (np.arange(rows) + 0.5) * (top_deg - bottom_deg) / rows
 
 
 def kitti_files(folder: str | Path) -> list[Path]:
@@ -79,7 +123,11 @@ def _rings(cloud: Cloud) -> IndexArray:
 def kitti_frames(
     folder: str | Path, rules: Rules, *, columns: int | None = None, rows: RowRule = "ring"
 ) -> Iterator[Frame]:
-    """Every frame of a folder of KITTI ``.bin`` files."""
+    """Every frame of a folder of KITTI ``.bin`` files. Of elevation rows, points stand in the middle of their bins."""
+    if rows == "ring":
+        elevation, height = rules.row_elevation_deg, rules.row_height_m
+    else:
+        elevation, height = bin_elevation_deg(), np.zeros(ROWS)
     for path in kitti_files(folder):
         image = image_of_cloud(read_cloud(path), path, rules, columns=columns, rows=rows)
-        yield Frame(path.stem, image.distance, image.intensity, rules.distance_unit_m)
+        yield Frame(path.stem, image.distance, image.intensity, rules.distance_unit_m, elevation, height, image.cut_deg)

@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import types
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
 import yaml
 
-from .beams import beam_table
-from .rules import Rules
+from .beams import BeamTable, beam_table, uniform_beam_table
+from .frames import RowRule, bin_elevation_deg
+from .rules import ROWS, Rules
 
-__all__ = ["Loss", "NetworkRecipe", "Recipe", "RecipeError", "TrainingRecipe", "load_recipe", "recipe_names"]
+__all__ = [
+    "NETWORKS",
+    "DataRecipe",
+    "Loss",
+    "NetworkRecipe",
+    "Recipe",
+    "RecipeError",
+    "TrainingRecipe",
+    "load_recipe",
+    "recipe_names",
+]
+
+NETWORKS = ("distance", "intensity")
 
 
 class RecipeError(ValueError):
@@ -21,38 +37,92 @@ class RecipeError(ValueError):
 
 @dataclass(frozen=True)
 class Loss:
-    kind: Literal["robust", "l1"]
+    """Errors are in metres for distance and in 8-bit steps for intensity."""
+
+    kind: Literal["l1", "robust", "charbonnier", "chamfer"]
     knee_m: float = 2.0
     """Of ``robust``: e^2 / (1 + e^2 / knee^2) grows like a square below it and saturates above."""
+    scale_m: float = 0.1
+    """Of ``charbonnier``: (e^2 + scale^2)^(power / 2) is smooth below it ..."""
+    power: float = 1.0
+    """... and grows with this power above."""
+    pixels: Literal["returns", "all"] = "returns"
+    """Of the pixelwise losses: pixels whose truth is a return, or all, an empty one being 0. ``all`` needs
+    ``batch_images``."""
+    search: Literal["exact", "window"] = "exact"
+    """Of ``chamfer``: the nearest point of the image, or of the pixels around."""
+    empty: Literal["excluded", "origin"] = "excluded"
+    """Of ``chamfer``: pixels without a return make no points, or points at the sensor, as whoever projects a whole
+    image back gets them. ``origin`` teaches a network without an empty-pixel rule to give small values where it sees
+    nothing, which the range limits then remove."""
+    search_rows: int = 2
+    search_columns: int = 8
 
 
 @dataclass(frozen=True)
 class NetworkRecipe:
-    widths: tuple[int, int, int]
+    widths: tuple[tuple[int, ...], tuple[int, ...]]
+    """Filters of each pointwise convolution, units of each hidden layer. In a file: ``[[8, 2], [12]]``, or
+    ``[8, 2, 12]`` for the standard layout of two convolutions and one hidden layer."""
     slope: float
     inputs: Literal["raw", "difference"]
     output: Literal["raw", "residual"]
     scale: float
+    relu_in_loss: bool = False
+    """The loss sees ``max(y, 0)``, as the paper trains; else y itself, so that a negative output has a gradient."""
+
+    @property
+    def exportable(self) -> bool:
+        """A model file holds one hidden layer; convolutions, being linear, fold into two."""
+        return len(self.widths[1]) == 1
 
 
 @dataclass(frozen=True)
 class TrainingRecipe:
-    steps: int
-    batch: int
     learning_rate: float
     mirror: bool
+    """Every other step sees its windows left-right reversed."""
     distance_loss: Loss
     intensity_loss: Loss
+    steps: int = 0
+    epochs: int | dict[str, int] = 0
+    """Instead of ``steps``; ``{distance: 200, intensity: 100}`` where they differ."""
+    batch: int = 0
+    """Windows a step, drawn from all."""
+    batch_images: int = 0
+    """Instead of ``batch``: whole images a step, each once an epoch."""
+    weight_decay: float = 0.0
+    schedule: Literal["cosine", "plateau", "constant"] = "cosine"
+    """``plateau``: the learning rate is halved after ``patience`` epochs without a better mean loss."""
+    patience: int = 10
+
+    def loss(self, network: str) -> Loss:
+        return self.distance_loss if network == "distance" else self.intensity_loss
+
+    def epochs_of(self, network: str) -> int:
+        return self.epochs[network] if isinstance(self.epochs, dict) else self.epochs
 
 
 @dataclass(frozen=True)
 class DataRecipe:
     source: Literal["simulator", "kitti"]
-    frames: int
+    frames: int = 0
+    """Of ``kitti``: at most so many, 0 for all."""
     seed: int = 0
     frames_per_scene: int = 1
+    projection: Literal["aligned", "recorded"] = "aligned"
+    """Of ``simulator``: ``aligned`` casts every laser at its column's centre; ``recorded`` fires raw columns and puts
+    their points into an image as recorded frames are, so that the lasers' sideways offset moves points between
+    columns, and columns collide or stay empty as they do there."""
+    firing_columns: int = 2083
+    """Of ``recorded``: firings per turn, at ``rate_hz`` turns a second (2083 at 10 Hz: an HDL-64E)."""
+    rate_hz: float = 10.0
     folder: str = ""
-    """Of ``kitti``: a folder of .bin files; weights trained so may not be used commercially."""
+    """Of ``kitti``: a folder of .bin files, or nothing for ``kitti/frames`` in the folder UPBEAM_DATA names; weights
+    trained so may not be used commercially."""
+    only_drives: tuple[str, ...] = ()
+    """Of ``kitti``: only frames of these drives of the folder's ``drives.tsv``."""
+    without_drives: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -60,16 +130,31 @@ class Recipe:
     name: str
     seed: int
     beams: str
+    """The sensor: of the simulator, and of ring rows."""
     columns: int
     rules: dict[str, Any]
     data: tuple[DataRecipe, ...]
-    windows: int
     networks: dict[str, NetworkRecipe]
     training: TrainingRecipe
+    windows: int = 0
+    """Windows drawn from all frames, for both networks, where ``training.batch`` counts windows."""
+    rows: RowRule = "ring"
+    validation: tuple[DataRecipe, ...] = ()
+    """Frames the result is judged on; never trained on."""
+
+    def simulated_beams(self) -> BeamTable:
+        return beam_table(self.beams)
 
     def make_rules(self) -> Rules:
         """Rules of a model whose columns are azimuth aligned, as recordings are."""
-        return Rules.for_beams(beam_table(self.beams).aligned(), columns=self.columns, **self.rules)
+        beams = beam_table(self.beams).aligned() if self.rows == "ring" else self._elevation_bins()
+        return Rules.for_beams(beams, columns=self.columns, **self.rules)
+
+    def _elevation_bins(self) -> BeamTable:
+        """The paper's rows as if each were a beam in the middle of its bin."""
+        unit = beam_table(self.beams).distance_unit_m
+        table = uniform_beam_table(ROWS, 2.0, -24.9, columns=self.columns, distance_unit_m=unit)
+        return replace(table, name=f"elevation-{ROWS}", elevation_deg=np.asarray(bin_elevation_deg()))
 
 
 def recipe_names() -> list[str]:
@@ -78,7 +163,7 @@ def recipe_names() -> list[str]:
 
 
 def load_recipe(name: str | Path) -> Recipe:
-    """A shipped recipe by name, or a YAML file."""
+    """A shipped recipe by name, or a YAML file. Raises RecipeError."""
     path = Path(name)
     if path.suffix in {".yaml", ".yml"}:
         try:
@@ -105,46 +190,96 @@ def _recipe(raw: Any, where: str) -> Recipe:
     top = _mapping(raw, where)
     networks = _mapping(top.get("networks"), f"{where}: networks")
     training = dict(_mapping(top.get("training"), f"{where}: training"))
-    if set(networks) != {"distance", "intensity"}:
+    if set(networks) != set(NETWORKS):
         raise RecipeError(
             f"{where}: networks must be distance and intensity, got {', '.join(map(str, networks)) or 'none'}"
         )
     for key in ("distance_loss", "intensity_loss"):
         training[key] = _build(Loss, training.get(key), f"{where}: training.{key}")
-    data = top.get("data")
-    if not isinstance(data, list) or not data:
-        raise RecipeError(f"{where}: data must be a list of sources")
     parts = {
         "networks": {k: _network(v, f"{where}: networks.{k}") for k, v in networks.items()},
         "training": _build(TrainingRecipe, training, f"{where}: training"),
-        "data": tuple(_build(DataRecipe, d, f"{where}: data[{k}]") for k, d in enumerate(data)),
+        "data": _sources(top.get("data"), f"{where}: data"),
+        "validation": _sources(top["validation"], f"{where}: validation") if "validation" in top else (),
     }
     recipe = _build(Recipe, {**top, **parts}, where)
-    _positive(recipe, where)
+    for problem in (*_wrong_numbers(recipe), *_contradictions(recipe)):
+        raise RecipeError(f"{where}: {problem}")
     return recipe
 
 
+def _sources(raw: Any, where: str) -> tuple[DataRecipe, ...]:
+    if not isinstance(raw, list) or not raw:
+        raise RecipeError(f"{where} must be a list of sources")
+    sources = []
+    for k, item in enumerate(raw):
+        lists = {key: tuple(v) for key, v in _mapping(item, f"{where}[{k}]").items() if isinstance(v, list)}
+        sources.append(_build(DataRecipe, {**item, **lists}, f"{where}[{k}]"))
+    return tuple(sources)
+
+
 def _network(raw: Any, where: str) -> NetworkRecipe:
-    network = _build(NetworkRecipe, raw, where)
-    widths = tuple(network.widths)
-    if len(widths) != 3 or not all(isinstance(w, int) and 1 <= w <= 64 for w in widths):
+    values = _mapping(raw, where)
+    widths = values.get("widths", ())
+    if isinstance(widths, list) and len(widths) == 3 and all(isinstance(w, int) for w in widths):
+        widths = [widths[:2], widths[2:]]
+    layered = isinstance(widths, list) and len(widths) == 2 and all(isinstance(part, list) and part for part in widths)
+    if not layered or not all(type(w) is int and 1 <= w <= 64 for part in widths for w in part):
         raise RecipeError(
-            f"{where}.widths must be three whole numbers of 1 to 64 (conv1, conv2, hidden), got {list(widths)}"
+            f"{where}.widths must be three whole numbers of 1 to 64 (conv1, conv2, hidden) "
+            f"or two lists of such ([convolutions], [hidden layers]), got {values.get('widths')}"
         )
-    return NetworkRecipe(widths, network.slope, network.inputs, network.output, network.scale)
+    return _build(NetworkRecipe, {**values, "widths": (tuple(widths[0]), tuple(widths[1]))}, where)
 
 
-def _positive(recipe: Recipe, where: str) -> None:
-    checks = {
-        "windows": recipe.windows,
-        "training.steps": recipe.training.steps,
-        "training.batch": recipe.training.batch,
-        "training.learning_rate": recipe.training.learning_rate,
-        **{f"data[{k}].frames": d.frames for k, d in enumerate(recipe.data)},
+def _wrong_numbers(recipe: Recipe) -> Iterator[str]:
+    training = recipe.training
+    positive: dict[str, Any] = {
+        "training.learning_rate": training.learning_rate,
+        "training.patience": training.patience,
     }
-    for key, value in checks.items():
-        if not isinstance(value, int | float) or not value > 0:
-            raise RecipeError(f"{where}: {key} is {value!r}, expected a number above 0")
+    for key, loss in (("distance_loss", training.distance_loss), ("intensity_loss", training.intensity_loss)):
+        for name in ("knee_m", "scale_m", "power", "search_rows", "search_columns"):
+            positive[f"training.{key}.{name}"] = getattr(loss, name)
+    for key, network in recipe.networks.items():
+        positive[f"networks.{key}.scale"] = network.scale
+    for key, sources in (("data", recipe.data), ("validation", recipe.validation)):
+        for k, source in enumerate(sources):
+            positive |= {
+                f"{key}[{k}].{n}": getattr(source, n) for n in ("firing_columns", "rate_hz", "frames_per_scene")
+            }
+            if source.source == "simulator":
+                positive[f"{key}[{k}].frames"] = source.frames
+    for key, value in positive.items():
+        if not 0 < value < float("inf"):
+            yield f"{key} is {value!r}, expected a number above 0"
+    if not 0 <= training.weight_decay < 1:
+        yield f"training.weight_decay is {training.weight_decay!r}, expected 0 to 1"
+
+
+def _contradictions(recipe: Recipe) -> Iterator[str]:
+    training, epochs = recipe.training, recipe.training.epochs
+    if isinstance(epochs, dict) and set(epochs) != set(NETWORKS):
+        yield "training.epochs names other networks than distance and intensity"
+        return
+    lengths = [training.epochs_of(name) for name in NETWORKS]
+    if (training.steps > 0) == (min(lengths) > 0) or training.steps < 0 or min(lengths) < 0:
+        yield f"one of training.steps and training.epochs must be above 0, got {training.steps} and {epochs}"
+    if (training.batch > 0) == (training.batch_images > 0) or min(training.batch, training.batch_images) < 0:
+        yield (
+            "one of training.batch (windows) and training.batch_images must be above 0, "
+            f"got {training.batch} and {training.batch_images}"
+        )
+    if training.batch > 0 and recipe.windows <= 0:
+        yield f"windows is {recipe.windows!r}, expected a number above 0"
+    for key, loss in (("distance_loss", training.distance_loss), ("intensity_loss", training.intensity_loss)):
+        if training.batch > 0 and (loss.kind == "chamfer" or loss.pixels == "all"):
+            yield f"training.{key} looks at whole images: it needs training.batch_images instead of training.batch"
+    if training.intensity_loss.kind == "chamfer":
+        yield "training.intensity_loss.kind is chamfer, which only distances have"
+    for source in (*recipe.data, *recipe.validation):
+        if recipe.rows == "elevation" and source.source == "simulator" and source.projection != "recorded":
+            yield "rows: elevation needs projection: recorded of a simulator source"
 
 
 T = TypeVar("T")
@@ -156,10 +291,41 @@ def _build(kind: type[T], raw: Any, where: str) -> T:
     surplus = sorted(set(map(str, values)) - known)
     if surplus:
         raise RecipeError(f"{where}: unknown key {', '.join(surplus)}; known: {', '.join(sorted(known))}")
+    hints = get_type_hints(kind)
+    for key, value in values.items():
+        if not _fits(value, hints[key]):
+            raise RecipeError(f"{where}: {key} is {value!r}, expected {_words(hints[key])}")
     try:
         return kind(**values)
     except TypeError as error:
         raise RecipeError(f"{where}: {error}") from None
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value of a file has the type of its field."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return value in arguments
+    if origin in (Union, types.UnionType):
+        return any(_fits(value, one) for one in arguments)
+    if origin is tuple:
+        inner = [arguments[0]] * len(value) if arguments[-1:] == (...,) and isinstance(value, tuple) else arguments
+        return isinstance(value, tuple) and len(inner) == len(value) and all(map(_fits, value, inner))
+    if origin is dict:
+        return isinstance(value, Mapping) and all(
+            _fits(key, arguments[0]) and _fits(one, arguments[1]) for key, one in value.items()
+        )
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is int:
+        return type(value) is int
+    return hint is Any or isinstance(value, hint)
+
+
+def _words(hint: Any) -> str:
+    if get_origin(hint) is Literal:
+        return " or ".join(map(str, get_args(hint)))
+    return {int: "a whole number", float: "a number", bool: "true or false", str: "a name"}.get(hint, str(hint))
 
 
 def _mapping(raw: Any, where: str) -> dict[str, Any]:

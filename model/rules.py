@@ -51,7 +51,8 @@ class Rules:
     max_count: int
     row_max_count: NDArray[np.int64]
     """[64] farthest count the networks see in an input row (even) or give in a generated one (odd), at most
-    ``max_count``. A beam that points down meets the ground; what returns from several times as far is a mirror image."""
+    ``max_count``. A beam that points down meets the ground: what returns from several times as far is a mirror
+    image."""
     cut_deg: float = 180.0
     edge: Literal["zero", "seam"] = "seam"
     last_row: Literal["repeat", "empty"] = "empty"
@@ -102,8 +103,8 @@ class Rules:
         """Rules for a 32-beam table (generated rows half way between beams) or a 64-beam one (every other beam is
         input).
 
-        A row that points down is limited to ``ground_reach`` times its way to flat ground ``sensor_height_m`` below (0: no
-        such limit). Measured on 26 KITTI frames: factors of 2 to 6 remove the same mirror images."""
+        A row that points down is limited to ``ground_reach`` times its way to flat ground ``sensor_height_m`` below
+        (0: no such limit). Measured on 26 KITTI frames: factors of 2 to 6 remove the same mirror images."""
         if beams.beams not in (BEAMS, ROWS):
             raise RulesError(f"beam table {beams.name!r} has {beams.beams} beams, expected {BEAMS} or {ROWS}")
         native = beams.beams == BEAMS
@@ -113,7 +114,7 @@ class Rules:
         elevation = between_rows(beams.elevation_deg) if native else beams.elevation_deg
         height = between_rows(beams.vertical_offset_m) if native else beams.vertical_offset_m
         return cls(
-            sensor=beams.name if native else f"{beams.name}/2",
+            sensor=beams.name if native else _half_name(beams.name),
             columns=columns or beams.columns,
             distance_unit_m=unit,
             row_elevation_deg=elevation,
@@ -155,10 +156,15 @@ class Rules:
         return limits[:, None] if len(image) == len(limits) else np.array([[self.max_count]])
 
 
+def _half_name(name: str) -> str:
+    """Of every other beam of a table: a doubled table's are the sensor's own."""
+    return name.removesuffix("*2") if name.endswith("*2") else f"{name}/2"
+
+
 def ground_limits(
     elevation_deg: FloatArray, height_m: FloatArray, reach: float, unit_m: float, limits: tuple[int, int]
 ) -> NDArray[np.int64]:
-    """Farthest count of each row within ``limits``: ``reach`` times the way to flat ground, for rows that point down."""
+    """Farthest count of each row within ``limits``: ``reach`` times the way to flat ground, if it points down."""
     if reach < 0 or not np.isfinite(reach):
         raise RulesError(f"ground_reach {reach}, expected 0 (no limit) or a positive factor")
     counts = np.full(len(elevation_deg), limits[1], dtype=np.int64)

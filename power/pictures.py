@@ -24,10 +24,13 @@ from numpy.typing import NDArray
 
 __all__ = [
     "Panel",
+    "RatioPanel",
     "plot_birds_eye",
     "plot_close_up",
+    "plot_error_maps",
     "plot_latency_histogram",
     "plot_range_images",
+    "plot_ratios",
     "plot_timeline",
 ]
 
@@ -40,6 +43,7 @@ GENERATED = "#e8710a"
 GRID = "#d9d9d9"
 NO_RETURN = "#9aa0a6"
 _NEAR_M, _FAR_M = 3.0, 80.0
+_FAR_RATIO = 3.0
 _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.5,
@@ -247,12 +251,86 @@ def _scale(kind: str) -> tuple[Colormap, Normalize]:
     return colormaps["magma"].with_extremes(bad=NO_RETURN), Normalize(0, 160, clip=True)
 
 
+@_styled
+def plot_error_maps(
+    panels: Sequence[Panel], *, limit_m: float = 2.0, half_angle_deg: float = 90.0, cut_deg: float = 180.0
+) -> Figure:
+    """Signed errors one below the other, cropped to the view ahead: ``image[rows, W]``, generated - real in metres.
+
+    NaN, where one of the two is missing, is grey. Errors beyond ``limit_m`` have the darkest colour: what is dark is
+    wrong, the hue says which way.
+    """
+    figure = _figure(1.6 * len(panels) + 0.5)
+    all_axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
+    colours = colormaps["PuOr"].with_extremes(bad=NO_RETURN)
+    for axes, panel in zip(all_axes, panels, strict=True):
+        image = np.asarray(panel.image, dtype=np.float64)
+        azimuth, columns = _ahead(image.shape[1], half_angle_deg, cut_deg)
+        shown = np.ma.masked_invalid(image[:, columns])
+        extent = (azimuth[0], azimuth[-1], image.shape[0] - 0.5, -0.5)
+        drawn = axes.imshow(
+            shown, cmap=colours, norm=Normalize(-limit_m, limit_m), aspect="auto", interpolation="nearest",
+            extent=extent,
+        )  # fmt: skip
+        axes.set_title(panel.title)
+        axes.set_ylabel("judged row")
+        axes.set_yticks([0, image.shape[0] - 1])
+    all_axes[-1].set_xlabel("azimuth, degrees to the right of straight ahead (grey: no pair)")
+    bar = figure.colorbar(drawn, ax=list(all_axes), pad=0.01, aspect=30, extend="both")
+    bar.set_label("generated - real (m)")
+    return figure
+
+
 def _ahead(columns: int, half_angle_deg: float, cut_deg: float) -> tuple[FloatArray, NDArray[np.int64]]:
     """Azimuths within the angle, left to right, and their columns."""
     middle = (cut_deg + (np.arange(columns) + 0.5) * 360.0 / columns + 180.0) % 360.0 - 180.0
     order = np.argsort(middle, kind="stable")
     inside = order[np.abs(middle[order]) <= half_angle_deg]
     return middle[inside], inside
+
+
+# -------------------------------------------------------------------------------------------------------- accuracy
+
+
+@dataclass(frozen=True)
+class RatioPanel:
+    """One metric: per method its ratio to the base method and its interval (None: not known). NaN is not drawn."""
+
+    title: str
+    methods: Sequence[str]
+    values: Sequence[float]
+    intervals: Sequence[tuple[float, float] | None]
+
+
+@_styled
+def plot_ratios(panels: Sequence[RatioPanel], base: str) -> Figure:
+    """Metrics side by side, methods one below the other: left of the line at 1 is better than the base method.
+
+    A ratio beyond 3 is drawn at the edge, with its value.
+    """
+    figure = _figure(0.32 * len(panels[0].methods) + 1.2)
+    for axes, panel in zip(figure.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels, strict=True):
+        axes.axvline(1.0, color="black", linewidth=1.2)
+        for place, (value, interval) in enumerate(zip(panel.values, panel.intervals, strict=True)):
+            if np.isfinite(value):
+                _draw_ratio(axes, place, value, interval)
+        axes.set_xlim(0, _FAR_RATIO)
+        axes.set_title(panel.title)
+        axes.grid(axis="x", color=GRID, linewidth=0.5)
+        axes.set_axisbelow(True)
+        axes.set_yticks(range(len(panel.methods)), labels=list(panel.methods))
+        axes.set_ylim(len(panel.methods) - 0.5, -0.5)
+    figure.supxlabel(f"ratio to {base} on the same frames, 95 % intervals over frames", fontsize=9.5)
+    return figure
+
+
+def _draw_ratio(axes: Axes, place: int, value: float, interval: tuple[float, float] | None) -> None:
+    if value > _FAR_RATIO:
+        axes.annotate(f"{value:.1f} >", (_FAR_RATIO, place), ha="right", va="center", fontsize=8.5)
+        return
+    if interval is not None:
+        axes.hlines(place, *interval, color="#4c78a8", linewidth=3, alpha=0.6)
+    axes.plot(value, place, marker="o", markersize=5, color=MEASURED)
 
 
 # ---------------------------------------------------------------------------------------------------------- clouds

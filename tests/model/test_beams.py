@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from upbeam.model.beams import BeamTableError, beam_table, beam_table_names, between_rows, uniform_beam_table
+from upbeam.model.rules import Rules
 
 
 @pytest.mark.parametrize("name", ["hdl-64e", "hdl-64e/2", "hdl-32e", "vlp-32c"])
@@ -43,6 +44,16 @@ def test_column_offsets_round_half_up():
     table = uniform_beam_table(4, 3, -3)
     object.__setattr__(table, "azimuth_offset_deg", np.array([0.5, -0.5, 1.49, -1.51]))
     assert table.column_offsets(360).tolist() == [1, 0, 1, -2]
+
+
+def test_a_doubled_table_holds_the_sensor_in_its_even_rows():
+    table, double = beam_table("vlp-32c"), beam_table("vlp-32c*2")
+    assert double.beams == 64
+    assert np.array_equal(double.elevation_deg[::2], table.elevation_deg)
+    assert np.array_equal(double.azimuth_offset_deg[::2], table.azimuth_offset_deg)
+    assert double.elevation_deg[1] == pytest.approx((15 + 10.333) / 2)
+    assert Rules.for_beams(double).sensor == "vlp-32c"
+    assert np.array_equal(Rules.for_beams(double).row_elevation_deg, Rules.for_beams(table).row_elevation_deg)
 
 
 def test_between_rows():

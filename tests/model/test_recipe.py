@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import resources
 
+import numpy as np
 import pytest
 import yaml
+from scipy.spatial import cKDTree
 
-from upbeam.model.recipe import RecipeError, load_recipe, recipe_names
+from upbeam.cli.common import UserError
+from upbeam.cli.sources import recipe_frames, simulated_scans, source_frames
+from upbeam.model.beams import beam_table
+from upbeam.model.geometry import to_points
+from upbeam.model.recipe import DataRecipe, RecipeError, load_recipe, recipe_names
 
 
 @pytest.mark.parametrize("name", recipe_names())
@@ -37,6 +44,27 @@ def raw():
         (lambda r: r.update(data=[]), "data"),
         (lambda r: r["rules"].update(edge="round"), "edge"),
         (lambda r: r.update(beams="hdl-128"), "hdl-128"),
+        (lambda r: r["networks"]["distance"].update(widths=[[8, 2], []]), "widths"),
+        (lambda r: r["networks"]["distance"].update(widths=[[8, 2], [12, 65]]), "widths"),
+        (
+            lambda r: r["networks"]["distance"].update(inputs="squared"),
+            "inputs is 'squared', expected raw or difference",
+        ),
+        (lambda r: r["training"].update(learning_rate="1e-2"), "learning_rate is '1e-2', expected a number"),
+        (lambda r: r["training"].update(epochs=5), "training.steps and training.epochs"),
+        (lambda r: r["training"].update(steps=0, epochs={"distance": 5}), "training.epochs"),
+        (lambda r: r["training"].update(batch_images=5), "training.batch"),
+        (lambda r: r["training"].update(schedule="step"), "schedule"),
+        (lambda r: r["training"].update(weight_decay=-1.0), "weight_decay"),
+        (lambda r: r["training"]["distance_loss"].update(kind="l2"), "kind"),
+        (lambda r: r["training"]["distance_loss"].update(kind="chamfer"), "batch_images"),
+        (lambda r: r["training"]["intensity_loss"].update(pixels="all"), "batch_images"),
+        (lambda r: r["training"]["distance_loss"].update(power=0), "distance_loss.power"),
+        (lambda r: r["data"][0].update(source="carla"), "source is 'carla'"),
+        (lambda r: r["data"][0].update(frames=0), "frames"),
+        (lambda r: r["data"][0].update(projection="fish-eye"), "projection"),
+        (lambda r: r.update(rows="elevation"), "projection: recorded"),
+        (lambda r: r.update(validation=[]), "validation"),
     ],
 )
 def test_wrong_recipes_are_refused(tmp_path, change, named):
@@ -56,3 +84,99 @@ def test_files_that_are_no_recipe(tmp_path):
             load_recipe(path)
     with pytest.raises(RecipeError, match="No such file"):
         load_recipe(tmp_path / "absent.yaml")
+
+
+def test_the_paper_recipe_is_the_papers():
+    recipe = load_recipe("paper")
+    rules, training = recipe.make_rules(), recipe.training
+    assert (rules.edge, rules.empty, rules.last_row, rules.columns) == ("zero", "none", "repeat", 2048)
+    assert (rules.min_m, rules.max_m) == (3.0, 80.0)
+    assert (training.learning_rate, training.weight_decay, training.batch_images) == (1e-2, 1e-5, 100)
+    assert (training.epochs, training.schedule, training.patience) == (
+        {"distance": 200, "intensity": 100},
+        "plateau",
+        10,
+    )
+    assert (training.distance_loss.kind, training.intensity_loss.kind) == ("chamfer", "l1")
+    for network in recipe.networks.values():
+        assert network.widths == ((8, 2), (12,))
+        assert (network.slope, network.inputs, network.output, network.scale) == (0.01, "raw", "raw", 1.0)
+
+
+def test_elevation_rows_have_their_own_beams():
+    """Bins of 26.9 / 64 degrees from 2.0 down, heights of 0: no laser of the sensor."""
+    rules = load_recipe("paper").make_rules()
+    assert rules.row_elevation_deg[0] == pytest.approx(2.0 - 26.9 / 128)
+    assert rules.row_elevation_deg[-1] == pytest.approx(-24.9 + 26.9 / 128)
+    assert not rules.row_height_m.any()
+
+
+def test_ablations_change_the_graph_alone():
+    base = load_recipe("paper-small")
+    widths = {
+        "paper-4-filters": ((4, 2), (12,)),
+        "paper-10-8-6": ((10, 8, 6), (12,)),
+        "paper-second-hidden": ((8, 2), (12, 6)),
+    }
+    for name, expected in widths.items():
+        recipe = load_recipe(name)
+        assert (recipe.training, recipe.data, recipe.validation) == (base.training, base.data, base.validation)
+        for network, original in zip(recipe.networks.values(), base.networks.values(), strict=True):
+            assert network == replace(original, widths=expected)
+        assert recipe.networks["distance"].exportable == (name != "paper-second-hidden")
+
+
+def drives(folder, names, listed):
+    for name in names:
+        (folder / f"{name}.bin").write_bytes(b"")
+    (folder / "drives.tsv").write_text("frame\tdrive\n" + "".join(f"{f}\t{d}\n" for f, d in listed.items()))
+    return str(folder)
+
+
+def test_frames_are_split_by_drive(tmp_path):
+    folder = drives(tmp_path, "abcde", {"b": "drive-a", "d": "drive-a", "e": "drive-b"})
+    count = lambda **limits: source_frames(DataRecipe("kitti", folder=folder, **limits))  # noqa: E731
+    assert count() == 5
+    assert count(frames=2) == 2
+    assert count(only_drives=("drive-a",)) == 2
+    assert count(without_drives=("drive-a",)) == 3
+    assert count(without_drives=("drive-a", "drive-b")) == 2
+    with pytest.raises(UserError, match="drive-z"):
+        count(without_drives=("drive-z",))
+
+
+def test_frames_without_a_folder(tmp_path, monkeypatch):
+    monkeypatch.delenv("UPBEAM_DATA", raising=False)
+    with pytest.raises(UserError, match="UPBEAM_DATA"):
+        source_frames(DataRecipe("kitti"))
+    (tmp_path / "kitti" / "frames").mkdir(parents=True)
+    drives(tmp_path / "kitti" / "frames", "ab", {"a": "drive-a"})
+    monkeypatch.setenv("UPBEAM_DATA", str(tmp_path))
+    assert source_frames(DataRecipe("kitti")) == 2
+
+
+@pytest.mark.parametrize("rows", ["ring", "elevation"])
+def test_simulated_frames_projected_as_recordings(rows):
+    """Aligned casting gives every laser every column; points of firings collide and leave gaps, as recordings do."""
+    recipe = replace(load_recipe("smoke"), rows=rows)
+    rules = recipe.make_rules()
+    source = replace(recipe.data[0], frames=1, projection="recorded")
+    (frame,) = recipe_frames(recipe, rules, (source,))
+    scan = next(
+        iter(
+            simulated_scans(
+                beam_table("hdl-64e"), columns=2083, frames=1, seed=5, rate_hz=10.0, frames_per_scene=1, align=False
+            )
+        )
+    )
+    assert frame.distance.shape == (64, 2048)
+    assert np.array_equal(frame.elevation_deg, rules.row_elevation_deg)
+    assert np.array_equal(frame.row_height_m, rules.row_height_m)
+    assert np.array_equal(frame.surface > 0, frame.distance > 0)
+    # Put back into space, every pixel is one of the scan's points but for the pixel's width and height.
+    geometry = frame.elevation_deg, frame.distance_unit_m, frame.cut_deg, frame.row_height_m
+    made = to_points(frame.distance, frame.intensity, *geometry)[0][:, :3]
+    gap, _ = cKDTree(scan.points()[:, :3]).query(made)
+    # 1.7 mrad half a column, and 4.5 cm from a laser's sideways place to the axis; 3.7 mrad half an elevation bin
+    allowed = (0.002 if rows == "ring" else 0.0045) * np.linalg.norm(made, axis=1) + 0.06
+    assert np.mean(gap <= allowed) > 0.999

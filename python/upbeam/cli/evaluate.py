@@ -1,114 +1,422 @@
-"""``upbeam evaluate``: accuracy of the model beside every baseline, on recorded or simulated frames."""
+"""``upbeam evaluate``: accuracy of models beside every baseline, on recorded or simulated frames."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from upbeam.hw_sim.primitives import Surface
 from upbeam.model.baselines import BASELINES, Method
 from upbeam.model.beams import beam_table
-from upbeam.model.evaluate import Evaluation
+from upbeam.model.evaluate import BASE, Evaluation, Interval, in_unit, paired_ratio, with_limits
 from upbeam.model.evaluate import evaluate as run_evaluation
-from upbeam.model.frames import Frame, kitti_files, kitti_frames
-from upbeam.model.metrics import GENERATED
-from upbeam.model.rules import Rules
+from upbeam.model.frames import Frame, RowRule, kitti_files, kitti_frames
+from upbeam.model.metrics import BANDS_M
+from upbeam.model.rules import BEAMS, Rules, upsample_reference
+from upbeam.model.tulip import TulipMetrics, evaluate_tulip, tulip_frames, tulip_rules
 from upbeam.runtime.upsampler import Model, Upsampler, load_model
 
 from .common import JsonOption, UserError, emit_json, message, progress_bar, show, table
 from .sources import frame_of_scan, simulated_scans
 
-__all__ = ["evaluate", "evaluate_folder", "evaluation_table", "model_method"]
+__all__ = [
+    "Table",
+    "band_names",
+    "evaluate",
+    "evaluate_folder",
+    "evaluation_dict",
+    "evaluation_table",
+    "model_method",
+    "ratio_text",
+]
 
 U16 = NDArray[np.uint16]
 U8 = NDArray[np.uint8]
+FloatArray = NDArray[np.float64]
+
+SHIPPED = "upbeam-fp32"
+CAPTURES = (".pcap", ".db3")
+NAME_WIDTH = 13
+ACCURACY = ("Chamfer", "MAE", "both", "ghosts", "cover")
+SURFACES = {int(s): s.name.lower() for s in Surface}
+"""Names of the simulator's labels."""
+NOTE = (
+    "measured on these frames. Chamfer: m2, mean of squares, both ways; MAE: metres where a return exists; both: where "
+    "both exist; grey: intensity MAE, 8-bit steps; ghosts, missed: over 0.5 m from any point of the other side; cover: "
+    f"real returns that got a point. Ratios are to {BASE} on the same frames, ± half a 95 % interval over frames."
+)
+TULIP_NOTE = (
+    "measured on these frames by TULIP's protocol: 16 x 1024 in, 64 x 1024 out, 80 m; MAE: metres, all pixels, no "
+    "return = 0; Chamfer: m2, mean of squares, both ways; empty pixels at the origin; voxels of 0.1 m. "
+    "docs/metrics.md says what differs."
+)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as text; the first of each row is its name."""
+
+    title: str
+    columns: list[str]
+    rows: list[list[str]]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Frames, how many at most, and what they are."""
+
+    frames: Iterable[Frame]
+    count: int
+    rows: str
 
 
 def evaluate(
-    source: Annotated[str, typer.Argument(help="'sim', a KITTI .bin file, or a folder of them.")],
-    model: Annotated[str | None, typer.Option(help="A .ubm model instead of the shipped one.")] = None,
+    source: Annotated[
+        str, typer.Argument(help="'sim', a KITTI .bin file, a folder of them, or a capture (.pcap, .db3).")
+    ],
+    model: Annotated[
+        list[str] | None,
+        typer.Option(help="A .ubm model instead of the shipped one; may be given several times."),
+    ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="At most so many frames (sim: 20).")] = None,
     rows: Annotated[str, typer.Option(help="ring or elevation (the paper's binning).")] = "ring",
+    columns: Annotated[
+        int | None, typer.Option(min=4, max=65535, help="Width of the images, where not the model's.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the simulator; training used 1000 and up.")] = 1,
+    full: Annotated[bool, typer.Option("--full", help="Voxels and whole clouds as well.")] = False,
+    bands: Annotated[bool, typer.Option("--bands", help="By range band, and by surface in simulation.")] = False,
+    protocol: Annotated[str, typer.Option(help="upbeam, or tulip: 16 -> 64 rows x 1024, KITTI.")] = "upbeam",
+    report: Annotated[Path | None, typer.Option(help="Folder for evaluate.html with pictures of one frame.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare generated rows with the real ones that were hidden: even rows in, odd rows 1 to 61 judged."""
+    """Compare generated rows with the real ones that were hidden: even rows in, odd rows between them judged."""
     if rows not in ("ring", "elevation"):
         raise UserError(f"--rows {rows}: expected ring or elevation")
-    loaded = load_model(model)
-    found, total = _frames(source, loaded, frames, "ring" if rows == "ring" else "elevation", seed)
-    result = _run(found, total, loaded, quiet=as_json)
+    if protocol not in ("upbeam", "tulip"):
+        raise UserError(f"--protocol {protocol}: expected upbeam or tulip")
+    models = _models(model or [])
+    methods = _methods(models)
+    first = next(iter(models.values()))
+    if protocol == "tulip":
+        if report is not None or full or bands or columns or rows != "ring":
+            raise UserError(
+                "--protocol tulip sets its own rows, columns and metrics: no --report, --full, --bands, ..."
+            )
+        _tulip(source, methods, first, frames, as_json=as_json)
+        return
+    found = _source(source, first, frames, "ring" if rows == "ring" else "elevation", columns, seed)
+    pictured: list[Frame] = []
+
+    def keep_first(frame: Frame) -> None:
+        if not pictured:
+            pictured.append(frame)
+
+    result = _run(found, methods, first, keep_first, full=full, parts=bands or report is not None, quiet=as_json)
+    summary = {
+        "source": source,
+        "rows": found.rows,
+        "columns": int(pictured[0].distance.shape[1]),
+        "models": {name: {"crc32": f"{m.crc32:08x}", "sensor": m.rules.sensor} for name, m in models.items()},
+        **evaluation_dict(result, first),
+    }
+    title = f"{source}: {len(result.frames)} frames, {found.rows} rows"
+    if report is not None:
+        from .evaluate_report import write_evaluation_report  # loads matplotlib
+
+        chosen = {name: methods[name] for name in (BASE, *models)}
+        tables = _tables(result, title, bands=True, full=full)
+        path = write_evaluation_report(report, title, result, summary, tables, pictured[0], chosen, first.rules)
+        message(f"report: {path}")
     if as_json:
-        emit_json({"source": source, "rows": rows, **evaluation_dict(result, loaded)})
+        emit_json(summary)
     else:
-        show(evaluation_table(result, f"{source}: {len(result.frames)} frames, {rows} rows, generated rows only"))
-        message(
-            "measured on these frames. x: ratio to valid-mean. Chamfer: m2, mean of squares, both ways; "
-            "MAE: metres, where a return exists; grey: intensity MAE, 8-bit steps; "
-            "ghosts: generated points over 0.5 m from any real one; cover: real returns that got a point."
-        )
+        for part in _tables(result, title, bands=bands, full=full):
+            show(_rich(part))
+        message(NOTE)
 
 
 def evaluate_folder(folder: str, model: Model) -> Evaluation:
     """Every method on every KITTI frame of a folder, ring rows."""
-    return _run(kitti_frames(folder, model.rules), len(kitti_files(folder)), model)
+    source = _Source(kitti_frames(folder, model.rules), len(kitti_files(folder)), "ring")
+    return _run(source, _methods({SHIPPED: model}), model)
 
 
 def model_method(model: Model) -> Method:
-    """The C runtime behind the interface of the baselines."""
-    upsampler = Upsampler(model)
+    """A model behind the interface of the baselines, under the caller's range limits.
+
+    The C runtime computes frames of 32 given rows in the model's own unit and limits; any other frame is computed by
+    the reference, which takes any number of rows.
+    """
+    upsamplers: dict[int, Upsampler] = {}
 
     def run(distance: U16, intensity: U8, rules: Rules) -> tuple[U16, U8]:
-        d, i = upsampler(distance, intensity)
-        return d[GENERATED], i[GENERATED]
+        own = in_unit(model.rules, rules.distance_unit_m)
+        if own is model.rules and len(distance) == BEAMS and _same_limits(own, rules):
+            width = distance.shape[1]
+            if width not in upsamplers:
+                upsamplers[width] = Upsampler(model, columns=None if width == model.columns else width)
+            d, i = upsamplers[width](distance, intensity)
+        else:
+            limited = with_limits(own, rules.min_count, rules.max_count)
+            d, i = upsample_reference(distance, intensity, model.file.folded, limited)
+        return d[1:-1:2], i[1:-1:2]
 
     return run
 
 
-def _frames(source: str, model: Model, limit: int | None, rows: Any, seed: int) -> tuple[Iterable[Frame], int]:
+def _same_limits(a: Rules, b: Rules) -> bool:
+    return (a.min_count, a.max_count) == (b.min_count, b.max_count)
+
+
+def _models(paths: Sequence[str]) -> dict[str, Model]:
+    """Models by the name of their method: the file's stem, or the shipped one's."""
+    if not paths:
+        return {SHIPPED: load_model()}
+    models: dict[str, Model] = {}
+    for path in paths:
+        name = Path(path).stem
+        if name in models or name in BASELINES:
+            raise UserError(f"--model {path}: another method is called {name}; rename the file")
+        models[name] = load_model(path)
+    return models
+
+
+def _methods(models: Mapping[str, Model]) -> dict[str, Method]:
+    return {**BASELINES, **{name: model_method(model) for name, model in models.items()}}
+
+
+# --------------------------------------------------------------------------------------------------------- frames
+
+
+def _source(source: str, model: Model, limit: int | None, rows: RowRule, columns: int | None, seed: int) -> _Source:
     if source == "sim":
-        base = model.rules.sensor.removesuffix("/2")
-        if base == model.rules.sensor:
-            raise UserError(
-                f"the model is made for {base}: its generated rows have no simulated truth; give recorded frames"
-            )
-        count = limit or 20
-        scans = simulated_scans(beam_table(base), columns=model.columns, frames=count, seed=seed, frames_per_scene=1)
-        return map(frame_of_scan, scans), count
+        return _simulated(model, limit or 20, columns, seed)
+    if Path(source).suffix.lower() in CAPTURES:
+        from upbeam.model.recordings import capture_frames
+
+        found = list(islice(capture_frames(source, columns=columns), limit))
+        return _Source(found, len(found), "laser")
     total = len(kitti_files(source))
-    return islice(kitti_frames(source, model.rules, rows=rows), limit), min(total, limit or total)
+    found_frames = kitti_frames(source, model.rules, columns=columns, rows=rows)
+    return _Source(islice(found_frames, limit), min(total, limit or total), rows)
 
 
-def _run(frames: Iterable[Frame], total: int, model: Model, *, quiet: bool = False) -> Evaluation:
-    methods: Mapping[str, Method] = {**BASELINES, "upbeam-fp32": model_method(model)}
-    with progress_bar("evaluating frames", total, quiet=quiet) as advance:
-        return run_evaluation(frames, methods, model.rules, lambda _: advance())
+def _simulated(model: Model, count: int, columns: int | None, seed: int) -> _Source:
+    base = model.rules.sensor.removesuffix("/2")
+    if base == model.rules.sensor:
+        raise UserError(
+            f"the model is made for {base}: its generated rows have no simulated truth; give recorded frames"
+        )
+    width = columns or model.columns
+    scans = simulated_scans(beam_table(base), columns=width, frames=count, seed=seed, frames_per_scene=1)
+    return _Source(map(frame_of_scan, scans), count, "ring")
+
+
+def _run(
+    source: _Source,
+    methods: Mapping[str, Method],
+    model: Model,
+    on_frame: Callable[[Frame], None] = lambda frame: None,
+    *,
+    full: bool = False,
+    parts: bool = False,
+    quiet: bool = False,
+) -> Evaluation:
+    with progress_bar("evaluating frames", source.count, quiet=quiet) as advance:
+
+        def seen(frame: Frame) -> None:
+            on_frame(frame)
+            advance()
+
+        return run_evaluation(
+            source.frames, methods, model.rules, seen, full=full, parts=parts, surfaces=SURFACES if parts else None
+        )
+
+
+# --------------------------------------------------------------------------------------------------------- results
 
 
 def evaluation_dict(result: Evaluation, model: Model) -> dict[str, Any]:
-    return {"frames": len(result.frames), "methods": result.means(), "model_crc32": f"{model.crc32:08x}"}
+    """For JSON: means per method, ratios with intervals, parts where they were asked for. Undefined values are null."""
+    data: dict[str, Any] = {
+        "frames": len(result.frames),
+        "methods": {name: _plain(metrics) for name, metrics in result.means().items()},
+        "ratio_to": BASE,
+        "ratio": {name: _intervals(metrics) for name, metrics in result.ratios().items()},
+        "model_crc32": f"{model.crc32:08x}",
+    }
+    if result.parts:
+        data["parts"] = {
+            part: {name: _plain(metrics) for name, metrics in methods.items()}
+            for part, methods in _sorted_parts(result).items()
+        }
+    return data
+
+
+def _plain(metrics: Mapping[str, float]) -> dict[str, float | None]:
+    return {key: _finite(value) for key, value in metrics.items()}
+
+
+def _intervals(metrics: Mapping[str, Interval]) -> dict[str, dict[str, float | None]]:
+    return {k: {"value": _finite(v.value), "low": v.low, "high": v.high} for k, v in metrics.items()}
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _sorted_parts(result: Evaluation) -> dict[str, dict[str, dict[str, float]]]:
+    """Range bands from near to far, then surfaces."""
+    means = result.part_means()
+    order = [*band_names(), *SURFACES.values()]
+    return {part: means[part] for part in sorted(means, key=lambda p: order.index(p) if p in order else len(order))}
 
 
 def evaluation_table(result: Evaluation, title: str) -> Any:
-    means = result.means()
-    base = means["valid-mean"]
+    """Means over the frames, to be shown."""
+    return _rich(_means_table(result, title))
 
-    def pair(m: dict[str, float], key: str, digits: int) -> list[str]:
-        return [f"{m[key]:.{digits}f}", f"{m[key] / base[key]:.2f}"]
 
+def _tables(result: Evaluation, title: str, *, bands: bool, full: bool) -> list[Table]:
+    made = [_means_table(result, title), _ratio_table(result)]
+    if full:
+        made += [_voxel_table(result), _chamfer_table(result)]
+    return made + _part_tables(result) if bands else made
+
+
+def _rich(part: Table) -> Any:
+    return table(part.title, part.columns, [[_short(name), *cells] for name, *cells in part.rows])
+
+
+def _means_table(result: Evaluation, title: str) -> Table:
     rows = [
-        [
-            name,
-            *pair(m, "chamfer_m2", 3),
-            *pair(m, "mae_m", 3),
-            *pair(m, "intensity_mae", 1),
-            f"{100 * m['ghost_share']:.1f} %",
-            f"{100 * m['coverage']:.1f} %",
-        ]
-        for name, m in means.items()
+        [name, *_accuracy(m), _percent(m["missed_share"]), _number(m["intensity_mae"], 1)]
+        for name, m in result.means().items()
     ]
-    return table(title, ["method", "Chamfer", "x", "MAE", "x", "grey", "x", "ghosts", "cover"], rows)
+    return Table(title, ["method", *ACCURACY, "missed", "grey"], rows)
+
+
+def _accuracy(m: Mapping[str, float]) -> list[str]:
+    """Cells under ``ACCURACY``."""
+    lengths = [_number(m.get(key), 3) for key in ("chamfer_m2", "mae_m", "mae_both_m")]
+    return [*lengths, *(_percent(m.get(key)) for key in ("ghost_share", "coverage"))]
+
+
+def _ratio_table(result: Evaluation) -> Table:
+    keys = ("chamfer_m2", "mae_m", "mae_both_m", "ghost_share", "intensity_mae")
+    rows = [
+        [name, *(ratio_text(ratios[key]) for key in keys)] for name, ratios in result.ratios().items() if name != BASE
+    ]
+    return Table(f"ratio to {BASE}", ["method", "Chamfer", "MAE", "both", "ghosts", "grey"], rows)
+
+
+def _voxel_table(result: Evaluation) -> Table:
+    keys = ("iou", "precision", "recall", "f1")
+    rows = [
+        [name, *(_number(m[f"{cloud}voxel_{key}"], 3) for cloud in ("", "cloud_") for key in keys)]
+        for name, m in result.means().items()
+    ]
+    return Table(
+        "voxels of 0.1 m: generated rows, then the whole cloud",
+        ["method", *(["IoU", "prec.", "rec.", "F1"] * 2)],
+        rows,
+    )
+
+
+def _chamfer_table(result: Evaluation) -> Table:
+    keys = ("chamfer_m2", "chamfer_m", "chamfer_origin_m2")
+    rows = [
+        [name, *(_number(m[f"{cloud}{key}"], 3) for cloud in ("", "cloud_") for key in keys)]
+        for name, m in result.means().items()
+    ]
+    return Table(
+        "Chamfer (squares and origin: m2, dist.: m): generated rows, then the whole cloud",
+        ["method", *(["squares", "dist.", "origin"] * 2)],
+        rows,
+    )
+
+
+def _part_tables(result: Evaluation) -> list[Table]:
+    return [
+        Table(part, ["method", *ACCURACY], [[name, *_accuracy(m)] for name, m in methods.items()])
+        for part, methods in _sorted_parts(result).items()
+    ]
+
+
+def band_names() -> list[str]:
+    return [f"{low:g}-{high:g} m" for low, high in BANDS_M]
+
+
+def ratio_text(ratio: Interval) -> str:
+    """``0.75 ±0.03``"""
+    if not math.isfinite(ratio.value):
+        return "-"
+    width = ratio.half_width
+    return f"{ratio.value:.2f}" if width is None else f"{ratio.value:.2f} ±{width:.2f}"
+
+
+def _short(name: str) -> str:
+    """Tables fit 80 columns."""
+    return name if len(name) <= NAME_WIDTH else name[: NAME_WIDTH - 1] + "…"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{100 * value:.1f} %"
+
+
+# ----------------------------------------------------------------------------------------------------------- TULIP
+
+
+def _tulip(source: str, methods: Mapping[str, Method], model: Model, limit: int | None, *, as_json: bool) -> None:
+    if source == "sim" or Path(source).suffix.lower() in CAPTURES:
+        raise UserError(f"{source}: TULIP's protocol judges KITTI .bin frames")
+    total = len(kitti_files(source))
+    rules = tulip_rules(model.rules)
+    with progress_bar("evaluating frames", min(total, limit or total), quiet=as_json) as advance:
+        frames = islice(tulip_frames(source, rules), limit)
+        result = evaluate_tulip(frames, methods, rules, lambda _: advance())
+    values = {name: _tulip_values(rows) for name, rows in result.items()}
+    count = len(result[BASE])
+    if as_json:
+        emit_json({"source": source, "protocol": "tulip", "frames": count, **_tulip_dict(values)})
+        return
+    title = f"{source}: {count} frames, TULIP's protocol"
+    show(_rich(Table(title, ["method", "MAE", "Chamfer", "IoU", "prec.", "recall", "F1"], _tulip_rows(values))))
+    message(TULIP_NOTE)
+
+
+def _tulip_values(rows: Sequence[TulipMetrics]) -> dict[str, FloatArray]:
+    as_dicts = [row.as_dict() for row in rows]
+    return {key: np.asarray([row[key] for row in as_dicts]) for key in as_dicts[0]}
+
+
+def _tulip_dict(values: Mapping[str, Mapping[str, FloatArray]]) -> dict[str, Any]:
+    base = values[BASE]
+    return {
+        "methods": {name: {k: float(v.mean()) for k, v in metrics.items()} for name, metrics in values.items()},
+        "ratio_to": BASE,
+        "ratio": {
+            name: _intervals({k: paired_ratio(v, base[k]) for k, v in metrics.items()})
+            for name, metrics in values.items()
+        },
+    }
+
+
+def _tulip_rows(values: Mapping[str, Mapping[str, FloatArray]]) -> list[list[str]]:
+    return [
+        [_short(name), *(_number(float(v.mean()), 3) for v in metrics.values())] for name, metrics in values.items()
+    ]

@@ -3,16 +3,25 @@ streams."""
 
 from __future__ import annotations
 
+import csv
 import os
 from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from upbeam.hw_sim import Scan, simulate_frames, simulate_parallel
 from upbeam.model.beams import BeamTable
-from upbeam.model.frames import Frame, kitti_frames
+from upbeam.model.frames import Frame, bin_elevation_deg, kitti_files, kitti_frames
+from upbeam.model.geometry import bin_elevation, project
 from upbeam.model.recipe import DataRecipe, Recipe
-from upbeam.model.rules import Rules
+from upbeam.model.rules import ROWS, Rules
 
-__all__ = ["frame_of_scan", "recipe_frames", "simulated_scans"]
+from .common import UserError
+
+__all__ = ["frame_of_scan", "recipe_frames", "recorded_frame_of_scan", "simulated_scans", "source_frames"]
 
 
 def simulated_scans(
@@ -37,21 +46,98 @@ def simulated_scans(
 
 def frame_of_scan(scan: Scan) -> Frame:
     aligned = scan.aligned()
-    return Frame(f"sim-{scan.frame:06d}", aligned.distance, aligned.intensity, aligned.distance_unit_m)
-
-
-def recipe_frames(recipe: Recipe, beams: BeamTable, rules: Rules) -> Iterator[Frame]:
-    """The training frames that a recipe names."""
-    for source in recipe.data:
-        yield from _source_frames(source, recipe, beams, rules)
-
-
-def _source_frames(source: DataRecipe, recipe: Recipe, beams: BeamTable, rules: Rules) -> Iterator[Frame]:
-    if source.source == "kitti":
-        for _, frame in zip(range(source.frames), kitti_frames(source.folder, rules), strict=False):
-            yield frame
-        return
-    scans = simulated_scans(
-        beams, columns=recipe.columns, frames=source.frames, seed=source.seed, frames_per_scene=source.frames_per_scene
+    beams = aligned.beams
+    return Frame(
+        f"sim-{scan.frame:06d}",
+        aligned.distance,
+        aligned.intensity,
+        aligned.distance_unit_m,
+        beams.elevation_deg,
+        beams.vertical_offset_m,
+        aligned.cut_deg,
+        aligned.surface,
     )
-    yield from map(frame_of_scan, scans)
+
+
+def recorded_frame_of_scan(scan: Scan, columns: int, cut_deg: float, *, elevation_rows: bool = False) -> Frame:
+    """The scan's points put into an image as a recorded cloud's are: the nearest return wins a pixel.
+
+    By ring, distances are the lasers' own paths; by the paper's elevation bins, distances from the sensor's origin.
+    """
+    beams, points = scan.beams, scan.points()
+    if elevation_rows:
+        rows, elevation, heights = bin_elevation(points), bin_elevation_deg(), np.zeros(ROWS)
+    else:
+        rows, elevation, heights = np.nonzero(scan.distance > 0)[0], beams.elevation_deg, beams.vertical_offset_m
+    image = project(points, rows, len(elevation), columns, scan.distance_unit_m, cut_deg, heights)
+    surfaces = np.append(scan.surface[scan.distance > 0], np.uint8(0))  # index -1, no return, takes the last
+    return Frame(
+        f"sim-{scan.frame:06d}",
+        image.distance,
+        image.intensity,
+        scan.distance_unit_m,
+        elevation,
+        heights,
+        image.cut_deg,
+        surfaces[image.index],
+    )
+
+
+def source_frames(source: DataRecipe) -> int:
+    """How many frames a source gives. Raises CloudError or UserError where a folder holds none."""
+    return source.frames if source.source == "simulator" else len(_kitti_files(source))
+
+
+def recipe_frames(recipe: Recipe, rules: Rules, sources: tuple[DataRecipe, ...] | None = None) -> Iterator[Frame]:
+    """The frames of ``sources``: those a recipe trains on unless told otherwise."""
+    for source in recipe.data if sources is None else sources:
+        if source.source == "kitti":
+            for path in _kitti_files(source):
+                yield from kitti_frames(path, rules, rows=recipe.rows)
+        else:
+            yield from _simulated_frames(source, recipe, rules)
+
+
+def _simulated_frames(source: DataRecipe, recipe: Recipe, rules: Rules) -> Iterator[Frame]:
+    beams = recipe.simulated_beams()
+    same: dict[str, Any] = {"frames": source.frames, "seed": source.seed, "frames_per_scene": source.frames_per_scene}
+    if source.projection == "aligned":
+        yield from map(frame_of_scan, simulated_scans(beams, columns=recipe.columns, **same))
+        return
+    for scan in simulated_scans(beams, columns=source.firing_columns, rate_hz=source.rate_hz, align=False, **same):
+        yield recorded_frame_of_scan(scan, recipe.columns, rules.cut_deg, elevation_rows=recipe.rows == "elevation")
+
+
+def _kitti_files(source: DataRecipe) -> list[Path]:
+    """The source's files in name order, of the drives it asks for; at most ``frames`` of them if that is above 0."""
+    folder = Path(source.folder) if source.folder else _default_folder()
+    files = kitti_files(folder)
+    drives = _drives(folder)
+    for name in (*source.only_drives, *source.without_drives):
+        if name not in drives.values():
+            raise UserError(f"{folder / 'drives.tsv'}: no frame of drive {name!r}, which the recipe names")
+    if source.only_drives:
+        files = [path for path in files if drives.get(path.stem) in source.only_drives]
+    files = [path for path in files if drives.get(path.stem) not in source.without_drives]
+    if not files:
+        raise UserError(f"{folder}: no frame is left of the drives the recipe asks for")
+    return list(islice(files, source.frames or None))
+
+
+def _default_folder() -> Path:
+    data = os.environ.get("UPBEAM_DATA")
+    if not data:
+        raise UserError("the recipe names no folder of frames: set UPBEAM_DATA to a folder that holds kitti/frames")
+    return Path(data) / "kitti" / "frames"
+
+
+def _drives(folder: Path) -> dict[str, str]:
+    """Frame name -> drive, from ``drives.tsv``; frames it does not list are drives of their own."""
+    table = folder / "drives.tsv"
+    if not table.is_file():
+        return {}
+    with table.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file, delimiter="\t"))
+    if rows and not {"frame", "drive"} <= set(rows[0]):
+        raise UserError(f"{table}: expected the columns frame and drive")
+    return {row["frame"]: row["drive"] for row in rows}
