@@ -81,10 +81,12 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports
 
 model: $(VENV)/.train
-	$(BIN)/upbeam train --recipe default --out quant/models/default.ubm --evaluate $(SHARED)/kitti/frames
+	$(BIN)/upbeam train --recipe default --out quant/models/hdl-64e.ubm $(if $(SHARED),--evaluate $(SHARED)/kitti/frames)
+	$(BIN)/upbeam train --recipe hdl-32e --out quant/models/hdl-32e.ubm
+	$(BIN)/upbeam train --recipe vlp-32c --out quant/models/vlp-32c.ubm
 
 bench: test-c
-	build/c/tests/kernels/checkkernels --bench --model quant/models/default.ubm
+	build/c/tests/kernels/checkkernels --bench --model quant/models/hdl-64e.ubm
 
 # What takes minutes: a ten-minute stream in real time, a million damaged model files, more random scenarios.
 soak: test-c $(VENV)/.dev

@@ -95,6 +95,13 @@ class TrainingRecipe:
     schedule: Literal["cosine", "plateau", "constant"] = "cosine"
     """``plateau``: the learning rate is halved after ``patience`` epochs without a better mean loss."""
     patience: int = 10
+    starts: int = 1
+    """Random starts: each runs the first eighth of the steps, the one with the lowest loss goes on."""
+    intensity_gain: float = 0.0
+    """Spread of factors drawn for the upper row, the lower row and the target of each intensity window: lasers are not
+    alike, and the simulator's are more alike than real ones. The natural logarithm's standard deviation."""
+    intensity_noise: float = 0.0
+    """The same for every pixel on its own."""
 
     def loss(self, network: str) -> Loss:
         return self.distance_loss if network == "distance" else self.intensity_loss
@@ -114,6 +121,8 @@ class DataRecipe:
     """Of ``simulator``: ``aligned`` casts every laser at its column's centre; ``recorded`` fires raw columns and puts
     their points into an image as recorded frames are, so that the lasers' sideways offset moves points between
     columns, and columns collide or stay empty as they do there."""
+    columns: int = 0
+    """Width of the images, 0 for the recipe's."""
     firing_columns: int = 2083
     """Of ``recorded``: firings per turn, at ``rate_hz`` turns a second (2083 at 10 Hz: an HDL-64E)."""
     rate_hz: float = 10.0
@@ -139,6 +148,8 @@ class Recipe:
     windows: int = 0
     """Windows drawn from all frames, for both networks, where ``training.batch`` counts windows."""
     rows: RowRule = "ring"
+    aligned: bool = True
+    """Columns of the model's sensor come azimuth aligned, as recordings are; else as the lasers fire."""
     validation: tuple[DataRecipe, ...] = ()
     """Frames the result is judged on; never trained on."""
 
@@ -146,8 +157,9 @@ class Recipe:
         return beam_table(self.beams)
 
     def make_rules(self) -> Rules:
-        """Rules of a model whose columns are azimuth aligned, as recordings are."""
-        beams = beam_table(self.beams).aligned() if self.rows == "ring" else self._elevation_bins()
+        """Rules of the model."""
+        sensor = beam_table(self.beams).aligned() if self.aligned else beam_table(self.beams)
+        beams = sensor if self.rows == "ring" else self._elevation_bins()
         return Rules.for_beams(beams, columns=self.columns, **self.rules)
 
     def _elevation_bins(self) -> BeamTable:
@@ -250,9 +262,16 @@ def _wrong_numbers(recipe: Recipe) -> Iterator[str]:
             }
             if source.source == "simulator":
                 positive[f"{key}[{k}].frames"] = source.frames
+            if source.columns and not 4 <= source.columns <= 65535:
+                yield f"{key}[{k}].columns is {source.columns!r}, expected 4 to 65535, or 0 for the recipe's"
     for key, value in positive.items():
         if not 0 < value < float("inf"):
             yield f"{key} is {value!r}, expected a number above 0"
+    if not 1 <= training.starts <= 64:
+        yield f"training.starts is {training.starts!r}, expected 1 to 64"
+    for name in ("intensity_gain", "intensity_noise"):
+        if not 0 <= getattr(training, name) <= 2:
+            yield f"training.{name} is {getattr(training, name)!r}, expected 0 to 2"
     if not 0 <= training.weight_decay < 1:
         yield f"training.weight_decay is {training.weight_decay!r}, expected 0 to 1"
 

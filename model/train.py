@@ -261,7 +261,11 @@ def train_networks(
         raise TrainingError("no frames to train on")
     where = pick_device(device)
     with _repeatable(where):
-        runs = {name: _Run(recipe, name, _batches(recipe, name, data, rules, where), where) for name in NETWORKS}
+        fresh = checkpoint is None or not checkpoint.exists()
+        runs = {
+            name: _best_start(recipe, name, _batches(recipe, name, data, rules, where), where, fresh)
+            for name in NETWORKS
+        }
         saved = None if checkpoint is None else _CheckpointFile(checkpoint, _identity(recipe, data), runs)
         if saved is not None:
             saved.load(where)
@@ -311,19 +315,31 @@ class _WindowBatches:
 
     def __init__(self, recipe: Recipe, name: str, data: Samples, rules: Rules, device: torch.device) -> None:
         self.settings, self.loss, self.device = recipe.training, recipe.training.loss(name), device
-        self.seed = [recipe.seed, len(name)]
+        self.name, self.seed = name, [recipe.seed, len(name)]
         self.unit = np.float32(rules.distance_unit_m if name == "distance" else 1.0)
         self.windows: NDArray[Any] = getattr(data, name)
         self.targets: NDArray[Any] = getattr(data, f"{name}_target")
         self.per_epoch = math.ceil(len(data) / self.settings.batch)
 
     def losses(self, step: int, network: TorchWindowNetwork) -> Iterator[tuple[Tensor, float]]:
-        index = np.random.default_rng([*self.seed, step]).integers(0, len(self.windows), self.settings.batch)
+        rng = np.random.default_rng([*self.seed, step])
+        index = rng.integers(0, len(self.windows), self.settings.batch)
         x, y = (torch.from_numpy(v[index].astype(np.float32) * self.unit) for v in (self.windows, self.targets))
+        if self.name == "intensity":
+            x, y = self._regraded(x, y, rng)
         if self.settings.mirror and step % 2 == 0:
             x = x[:, _MIRROR]
         error = _seen(network, x.to(self.device)) - y.to(self.device)
         yield pixel_errors(error, self.loss).mean(), 1.0
+
+    def _regraded(self, x: Tensor, y: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """Intensities as other lasers would have graded them."""
+        gain, noise = self.settings.intensity_gain, self.settings.intensity_noise
+        if gain == 0 and noise == 0:
+            return x, y
+        lasers = np.exp(gain * rng.standard_normal((len(x), 3)))[:, [0, 0, 0, 1, 1, 1, 2]]
+        factors = torch.from_numpy((lasers * np.exp(noise * rng.standard_normal(lasers.shape))).astype(np.float32))
+        return (x * factors[:, :6]).clamp(0, 255), (y * factors[:, 6]).clamp(0, 255)
 
 
 class _ImageBatches:
@@ -391,12 +407,29 @@ def _seen(network: TorchWindowNetwork, windows: Tensor) -> Tensor:
     return y
 
 
+def _best_start(recipe: Recipe, name: str, batches: _Batches, device: torch.device, fresh: bool) -> _Run:
+    """Saturating losses have poor minima that a run does not leave: look at several starts before choosing one.
+
+    A run that a checkpoint will fill needs no choice."""
+    if recipe.training.starts == 1 or not fresh:
+        return _Run(recipe, name, batches, device)
+    runs = [_Run(recipe, name, batches, device, start) for start in range(recipe.training.starts)]
+    for run in runs:
+        for _ in range(max(1, run.steps // 8)):
+            run.advance(lambda *_: None)
+    return min(runs, key=_recent_loss)
+
+
+def _recent_loss(run: _Run) -> float:
+    return float(np.mean([loss for _, loss in run.log[-4:]] or [_mean(run.since_log)]))
+
+
 class _Run:
     """The training of one network: all that a checkpoint must hold."""
 
-    def __init__(self, recipe: Recipe, name: str, batches: _Batches, device: torch.device) -> None:
+    def __init__(self, recipe: Recipe, name: str, batches: _Batches, device: torch.device, start: int = 0) -> None:
         settings = recipe.training
-        torch.manual_seed(recipe.seed)
+        torch.manual_seed(recipe.seed + start)
         self.name, self.batches = name, batches
         self.network = TorchWindowNetwork(recipe.networks[name]).to(device)
         self.steps = _run_steps(recipe, name, batches.per_epoch)

@@ -17,7 +17,17 @@ from upbeam.quant.ubm import ModelFile, UbmError, read_ubm
 from ._native import Model as NativeModel
 from ._native import Stream as NativeStream
 
-__all__ = ["BACKENDS", "PRECISIONS", "ColumnStream", "Columns", "Model", "Upsampler", "generated_rows", "load_model"]
+__all__ = [
+    "BACKENDS",
+    "PRECISIONS",
+    "ColumnStream",
+    "Columns",
+    "Model",
+    "Upsampler",
+    "generated_rows",
+    "load_model",
+    "shipped_models",
+]
 
 U16 = NDArray[np.uint16]
 U8 = NDArray[np.uint8]
@@ -25,6 +35,7 @@ F32 = NDArray[np.float32]
 
 PRECISIONS = ("fp32",)
 """Of this version; ``int16`` and ``int8`` need the integer contract."""
+DEFAULT_MODEL = "hdl-64e"
 BACKENDS = ("cpu",)
 """Of this version."""
 
@@ -62,16 +73,26 @@ class Model:
         return f"Model({self.rules.sensor!r}, {self.columns} columns, crc32 {self.crc32:08x})"
 
 
+def shipped_models() -> list[str]:
+    """Sensors a model is shipped for; ``hdl-64e`` (every other beam of it) is the default."""
+    folder = resources.files("upbeam.quant").joinpath("models")
+    return sorted(p.name.removesuffix(".ubm") for p in folder.iterdir() if p.name.endswith(".ubm"))
+
+
 def load_model(path: str | Path | None = None) -> Model:
-    """A ``.ubm`` model; without a path, the one shipped with the package. Raises UbmError naming the file."""
-    if path is None:
-        shipped = resources.files("upbeam.quant").joinpath("models").joinpath("default.ubm")
-        return Model(shipped.read_bytes())
-    read_ubm(path)  # its errors name the file
+    """A ``.ubm`` file, or a shipped model by its sensor's name (``hdl-64e``, the default, ``hdl-32e``, ``vlp-32c``).
+
+    Raises UbmError naming the file."""
+    name = str(path) if path is not None else DEFAULT_MODEL
+    if name in shipped_models():
+        return Model(resources.files("upbeam.quant").joinpath("models").joinpath(f"{name}.ubm").read_bytes())
+    if Path(name).suffix != ".ubm" and not Path(name).exists():
+        raise UbmError(f"{name}: no such model; shipped are {', '.join(shipped_models())}, or give a .ubm file")
+    read_ubm(name)  # its errors name the file
     try:
-        return Model(Path(path).read_bytes())
+        return Model(Path(name).read_bytes())
     except ValueError as error:
-        raise UbmError(f"{path}: {error}") from None
+        raise UbmError(f"{name}: {error}") from None
 
 
 def generated_rows() -> NDArray[np.bool_]:

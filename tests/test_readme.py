@@ -14,7 +14,7 @@ import pytest
 import upbeam
 
 ROOT = Path(__file__).resolve().parent.parent
-MODEL = ROOT / "quant" / "models" / "default.ubm"
+MODEL = ROOT / "quant" / "models" / "hdl-64e.ubm"
 
 
 def example(language: str) -> str:

@@ -7,7 +7,7 @@ distance64, intensity64 = up(distance32, intensity32)
 
 from importlib.metadata import version as _version
 
-from upbeam.runtime.upsampler import ColumnStream, Model, Upsampler, generated_rows, load_model
+from upbeam.runtime.upsampler import ColumnStream, Model, Upsampler, generated_rows, load_model, shipped_models
 
 __version__ = _version("upbeam")
-__all__ = ["ColumnStream", "Model", "Upsampler", "__version__", "generated_rows", "load_model"]
+__all__ = ["ColumnStream", "Model", "Upsampler", "__version__", "generated_rows", "load_model", "shipped_models"]

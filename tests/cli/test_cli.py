@@ -232,6 +232,14 @@ def test_another_sensor_plays_only_when_wished():
     assert result["frames"] == 2
 
 
+def test_a_native_sensor_goes_through_the_destagger_ring():
+    """A VLP-32C's lasers point up to 4.2 degrees aside: 11 columns of 904, and the column that is under way."""
+    result = run_json("stream", "--model", "vlp-32c", "--frames", "2", "--clock", "virtual")
+    assert result["delay_columns"] == 12
+    assert result["columns"] == 904
+    assert result["counts"]["columns_missing"] == 0
+
+
 def test_simulate_and_evaluate(tmp_path):
     run("simulate", "-o", tmp_path / "sim", "--frames", "2", "--seed", "4")
     files = sorted((tmp_path / "sim").iterdir())

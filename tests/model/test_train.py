@@ -366,7 +366,7 @@ def test_a_chamfer_of_nothing_has_no_gradient(torch, rng):
 def small_run(recipe, kind):
     """Seconds of training: windows, or images with the Chamfer loss and the plateau schedule."""
     if kind == "windows":
-        return replace(recipe, training=replace(recipe.training, steps=60, batch=512))
+        return replace(recipe, training=replace(recipe.training, steps=60, batch=512, starts=3))
     paper = load_recipe("paper-small")
     short = {"epochs": {"distance": 6, "intensity": 3}, "batch_images": 2, "mirror": True}
     training = replace(paper.training, schedule="plateau", patience=1, **short)
@@ -424,6 +424,39 @@ def test_an_interrupted_run_ends_with_the_same_bits(smoke, images, tmp_path, kin
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(TrainingError, match="no checkpoint"):
         train_networks(recipe, data, rules, checkpoint=path)
+
+
+def test_of_several_starts_the_best_goes_on(smoke):
+    """The chosen run is the one whose loss was lowest after an eighth of the steps, and it keeps what it learned."""
+    from upbeam.model import train
+
+    recipe, rules, samples = smoke
+    short = replace(recipe, training=replace(recipe.training, steps=400, starts=4))
+    batches = train._batches(short, "distance", samples, rules, train.pick_device("cpu"))
+    runs = [train._Run(short, "distance", batches, train.pick_device("cpu"), start) for start in range(4)]
+    for run in runs:
+        for _ in range(50):
+            run.advance(lambda *_: None)
+    losses = [run.log[-1][1] for run in runs]
+    chosen = train._best_start(short, "distance", batches, train.pick_device("cpu"), fresh=True)
+    assert len(set(losses)) == 4
+    assert chosen.log == runs[int(np.argmin(losses))].log
+    assert chosen.step == 50
+
+
+def test_regraded_intensities_stay_intensities(smoke, torch):
+    from upbeam.model import train
+
+    recipe, rules, samples = smoke
+    graded = replace(recipe, training=replace(recipe.training, intensity_gain=0.5, intensity_noise=0.5))
+    batches = train._batches(graded, "intensity", samples, rules, train.pick_device("cpu"))
+    x, y = torch.full((4000, 6), 100.0), torch.full((4000,), 100.0)
+    a, b = batches._regraded(x, y, np.random.default_rng(0))
+    assert 0 <= float(a.min()) < 50 < 150 < float(a.max()) <= 255
+    logs = torch.log(a / 100).numpy()
+    assert np.corrcoef(logs[:, 0], logs[:, 1])[0, 1] == pytest.approx(0.5, abs=0.1)  # one laser: half is shared
+    assert abs(np.corrcoef(logs[:, 0], logs[:, 3])[0, 1]) < 0.1  # another laser
+    assert float(b.std()) > 20
 
 
 def test_images_and_chamfer_learn(smoke, images):

@@ -10,6 +10,7 @@ from upbeam.model.beams import beam_table
 from upbeam.model.frames import kitti_frames
 from upbeam.model.geometry import to_metres
 from upbeam.model.network import WindowNetwork
+from upbeam.model.recipe import load_recipe
 from upbeam.model.rules import Rules, extract_windows, upsample_reference
 from upbeam.quant import ModelFile
 from upbeam.runtime._native import raw_windows
@@ -265,6 +266,27 @@ def test_models_that_cannot_be_loaded(tmp_path):
     (tmp_path / "flipped.ubm").write_bytes(data)
     with pytest.raises(ValueError, match=r"flipped\.ubm.*damaged"):
         upbeam.load_model(tmp_path / "flipped.ubm")
+
+
+@pytest.mark.parametrize("name", ["hdl-64e", "hdl-32e", "vlp-32c"])
+def test_shipped_models_are_what_their_recipes_make(name):
+    """Sensor, columns and rules of the file are those of the recipe, and the data may be used commercially."""
+    assert name in upbeam.shipped_models()
+    model = upbeam.load_model(name)
+    recipe = load_recipe("default" if name == "hdl-64e" else name)
+    rules = recipe.make_rules()
+    assert model.rules.sensor == rules.sensor
+    assert model.columns == rules.columns
+    assert model.rules.row_max_count.tolist() == rules.row_max_count.tolist()
+    assert model.rules.azimuth_offset_deg == pytest.approx(rules.azimuth_offset_deg, abs=1e-6)
+    assert model.file.provenance["recipe"] == recipe.name
+    assert model.file.provenance["licence"] == "Apache-2.0"
+    assert [n.multiply_adds for n in model.file.folded] == [96, 96]
+
+
+def test_unknown_model_names_are_listed():
+    with pytest.raises(ValueError, match="no such model; shipped are hdl-32e, hdl-64e, vlp-32c"):
+        upbeam.load_model("hdl-128")
 
 
 def test_two_threads_may_share_a_model_and_even_an_upsampler(rng):

@@ -14,7 +14,9 @@ __all__ = ["inspect"]
 
 
 def inspect(
-    model: Annotated[str | None, typer.Argument(help="A .ubm model; the shipped one if omitted.")] = None,
+    model: Annotated[
+        str | None, typer.Argument(help="A .ubm file or a shipped model's name; hdl-64e if omitted.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show sensor, rules, networks, provenance and metrics of a model."""

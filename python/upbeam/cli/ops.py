@@ -15,7 +15,7 @@ __all__ = ["ops"]
 
 
 def ops(
-    model: Annotated[str | None, typer.Option(help="A .ubm model instead of the shipped one.")] = None,
+    model: Annotated[str | None, typer.Option(help="A .ubm file, or hdl-32e or vlp-32c instead of hdl-64e.")] = None,
     columns: Annotated[
         int | None, typer.Option(min=4, max=65535, help="Columns per turn instead of the model's.")
     ] = None,

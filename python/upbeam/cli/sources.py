@@ -99,13 +99,13 @@ def recipe_frames(recipe: Recipe, rules: Rules, sources: tuple[DataRecipe, ...] 
 
 
 def _simulated_frames(source: DataRecipe, recipe: Recipe, rules: Rules) -> Iterator[Frame]:
-    beams = recipe.simulated_beams()
+    beams, columns = recipe.simulated_beams(), source.columns or recipe.columns
     same: dict[str, Any] = {"frames": source.frames, "seed": source.seed, "frames_per_scene": source.frames_per_scene}
     if source.projection == "aligned":
-        yield from map(frame_of_scan, simulated_scans(beams, columns=recipe.columns, **same))
+        yield from map(frame_of_scan, simulated_scans(beams, columns=columns, **same))
         return
     for scan in simulated_scans(beams, columns=source.firing_columns, rate_hz=source.rate_hz, align=False, **same):
-        yield recorded_frame_of_scan(scan, recipe.columns, rules.cut_deg, elevation_rows=recipe.rows == "elevation")
+        yield recorded_frame_of_scan(scan, columns, rules.cut_deg, elevation_rows=recipe.rows == "elevation")
 
 
 def _kitti_files(source: DataRecipe) -> list[Path]:

@@ -49,7 +49,7 @@ def stream(
     frames: Annotated[
         int | None, typer.Option(min=1, help="Frames to play (sim: 200; recordings: all, repeated if more).")
     ] = None,
-    model: Annotated[str | None, typer.Option(help="A .ubm model instead of the shipped one.")] = None,
+    model: Annotated[str | None, typer.Option(help="A .ubm file, or hdl-32e or vlp-32c instead of hdl-64e.")] = None,
     backend: Annotated[str, typer.Option(help="cpu.")] = "cpu",
     precision: Annotated[str, typer.Option(help="fp32.")] = "fp32",
     cpu: Annotated[str, typer.Option(help="Force an instruction set: scalar, avx2, avx512, neon.")] = "auto",

@@ -27,7 +27,7 @@ F32 = NDArray[np.float32]
 def upsample(
     source: Annotated[Path, typer.Argument(metavar="IN", help=".bin, .ply or .pcd cloud, or .npy/.npz range image.")],
     output: Annotated[Path, typer.Option("-o", "--output", help=".npz, .bin, .ply or .pcd.")],
-    model: Annotated[str | None, typer.Option(help="A .ubm model instead of the shipped one.")] = None,
+    model: Annotated[str | None, typer.Option(help="A .ubm file, or hdl-32e or vlp-32c instead of hdl-64e.")] = None,
     precision: Annotated[str, typer.Option(help="fp32.")] = "fp32",
     backend: Annotated[str, typer.Option(help="cpu.")] = "cpu",
     rows: Annotated[
