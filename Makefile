@@ -82,6 +82,7 @@ lint: $(VENV)/.dev
 
 model: $(VENV)/.train
 	$(BIN)/upbeam train --recipe default --out quant/models/hdl-64e.ubm $(if $(SHARED),--evaluate $(SHARED)/kitti/frames)
+	$(BIN)/upbeam train --recipe hidden-8 --out quant/models/hdl-64e-8.ubm $(if $(SHARED),--evaluate $(SHARED)/kitti/frames)
 	$(BIN)/upbeam train --recipe hdl-32e --out quant/models/hdl-32e.ubm
 	$(BIN)/upbeam train --recipe vlp-32c --out quant/models/vlp-32c.ubm
 

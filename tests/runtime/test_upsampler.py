@@ -268,12 +268,15 @@ def test_models_that_cannot_be_loaded(tmp_path):
         upbeam.load_model(tmp_path / "flipped.ubm")
 
 
-@pytest.mark.parametrize("name", ["hdl-64e", "hdl-32e", "vlp-32c"])
+RECIPES = {"hdl-64e": "default", "hdl-64e-8": "hidden-8", "hdl-32e": "hdl-32e", "vlp-32c": "vlp-32c"}
+
+
+@pytest.mark.parametrize("name", list(RECIPES))
 def test_shipped_models_are_what_their_recipes_make(name):
     """Sensor, columns and rules of the file are those of the recipe, and the data may be used commercially."""
-    assert name in upbeam.shipped_models()
+    assert upbeam.shipped_models() == sorted(RECIPES)
     model = upbeam.load_model(name)
-    recipe = load_recipe("default" if name == "hdl-64e" else name)
+    recipe = load_recipe(RECIPES[name])
     rules = recipe.make_rules()
     assert model.rules.sensor == rules.sensor
     assert model.columns == rules.columns
@@ -281,11 +284,11 @@ def test_shipped_models_are_what_their_recipes_make(name):
     assert model.rules.azimuth_offset_deg == pytest.approx(rules.azimuth_offset_deg, abs=1e-6)
     assert model.file.provenance["recipe"] == recipe.name
     assert model.file.provenance["licence"] == "Apache-2.0"
-    assert [n.multiply_adds for n in model.file.folded] == [96, 96]
+    assert [n.multiply_adds for n in model.file.folded] == [64 if name == "hdl-64e-8" else 96] * 2
 
 
 def test_unknown_model_names_are_listed():
-    with pytest.raises(ValueError, match="no such model; shipped are hdl-32e, hdl-64e, vlp-32c"):
+    with pytest.raises(ValueError, match="no such model; shipped are hdl-32e, hdl-64e, hdl-64e-8, vlp-32c"):
         upbeam.load_model("hdl-128")
 
 
