@@ -108,9 +108,6 @@ class BeamTable:
         repeated["laser_id"] = np.arange(2 * self.beams, dtype=np.float64)
         return replace(self, name=f"{self.name}*2", **repeated)
 
-    def with_columns(self, columns: int) -> BeamTable:
-        return replace(self, columns=columns)
-
     def column_offsets(self, columns: int) -> NDArray[np.int64]:
         """Azimuth offsets in whole columns of a turn of ``columns``, rounded half up."""
         return np.floor(self.azimuth_offset_deg * columns / 360.0 + 0.5).astype(np.int64)

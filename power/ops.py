@@ -12,8 +12,9 @@ from typing import Any
 
 from upbeam.model.network import PAPER_WIDTHS, WINDOW
 from upbeam.model.rules import PAIRS
+from upbeam.quant.ubm import ModelFile
 
-__all__ = ["PAPER_MEMORY_NOTE", "Layer", "OperationCount", "count_operations"]
+__all__ = ["PAPER_MEMORY_NOTE", "Layer", "OperationCount", "count_model", "count_operations"]
 
 FLOAT_BYTES = 4
 NETWORKS = 2
@@ -88,6 +89,14 @@ class OperationCount:
                 for x in (*self.dense, *self.folded)
             ],
         }
+
+
+def count_model(model: ModelFile, columns: int) -> OperationCount:
+    """Of a model's distance network; its intensity network has the same widths in all shipped models.
+
+    A file without its dense networks counts as the smallest dense graph that folds into it."""
+    hidden = model.folded[0].hidden
+    return count_operations(model.dense[0].widths if model.dense else (1, 1, hidden), columns, hidden)
 
 
 def count_operations(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from upbeam.runtime.live import quantiles_ms
 
@@ -27,6 +27,7 @@ __all__ = [
     "Panel",
     "Picture",
     "ReportError",
+    "page_template",
     "plot_birds_eye",
     "plot_close_up",
     "plot_latency_histogram",
@@ -108,8 +109,8 @@ def verdict_line(live: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _render(data: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
-    live = data["live"]
+def page_template(name: str) -> Template:
+    """A page of ``power/templates``; pictures go into it through the filter ``data_url``."""
     environment = Environment(
         loader=PackageLoader("upbeam.power", "templates"),
         autoescape=True,
@@ -119,7 +120,12 @@ def _render(data: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
     )
     environment.filters["figures"] = _figures
     environment.filters["data_url"] = _data_url
-    return environment.get_template("report.html").render(
+    return environment.get_template(name)
+
+
+def _render(data: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
+    live = data["live"]
+    return page_template("report.html").render(
         title=data.get("title", "upbeam stream"),
         verdict=verdict_line(live),
         good=live["misses"] == 0,

@@ -112,6 +112,22 @@ def test_raw_outputs_agree_to_a_hundred_thousandth_of_the_terms(rng, data_dir, c
         assert error[windows.any_return].max() < 1e-5
 
 
+def test_every_instruction_set_gives_the_same_bits_on_real_frames(data_dir):
+    """All kernels fuse the same products in the same order, the scalar one too where the machine has FMA."""
+    if len(USABLE) == 1:
+        pytest.skip(f"this machine runs the {USABLE[0]} kernel only: nothing to compare")
+    model = upbeam.load_model()
+    ups = [upbeam.Upsampler(model, cpu=cpu) for cpu in USABLE]
+    windows = differing = 0
+    for frame in kitti_frames(data_dir / "kitti" / "frames", model.rules):
+        images = [up(frame.distance[::2], frame.intensity[::2]) for up in ups]
+        windows += 31 * model.columns
+        for distance, intensity in images[1:]:
+            differing += int(((distance != images[0][0]) | (intensity != images[0][1])).sum())
+    print(f"{differing} of {windows} windows differ between {', '.join(USABLE)}")
+    assert differing == 0
+
+
 def stream_image(model, distance, intensity, chunks, **options):
     stream = upbeam.ColumnStream(model, **options)
     parts, at = [], 0

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
 from upbeam.model.baselines import Method
@@ -19,7 +17,7 @@ from upbeam.model.geometry import to_metres
 from upbeam.model.metrics import Truth
 from upbeam.model.rules import Rules
 from upbeam.power.pictures import Panel, RatioPanel, plot_birds_eye, plot_error_maps, plot_range_images, plot_ratios
-from upbeam.power.report import Picture
+from upbeam.power.report import Picture, page_template
 
 from .evaluate import Table
 
@@ -45,15 +43,7 @@ def write_evaluation_report(
     ``frame``: the one to picture, with each of ``methods``.
     """
     pictures = [_ratio_picture(result), *_frame_pictures(frame, methods, rules_for(frame, rules))]
-    environment = Environment(
-        loader=PackageLoader("upbeam.power", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["data_url"] = lambda png: "data:image/png;base64," + base64.b64encode(png).decode("ascii")
-    html = environment.get_template("evaluate.html").render(title=title, tables=tables, pictures=pictures)
+    html = page_template("evaluate.html").render(title=title, tables=tables, pictures=pictures)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "evaluate.json").write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     path = folder / "evaluate.html"

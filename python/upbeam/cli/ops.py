@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from upbeam.power.ops import OperationCount, count_operations
+from upbeam.power.ops import OperationCount, count_model
 from upbeam.runtime.upsampler import load_model
 
 from .common import JsonOption, emit_json, show, table
@@ -23,9 +23,7 @@ def ops(
 ) -> None:
     """Count operations and memory of a model's networks."""
     loaded = load_model(model)
-    dense = loaded.file.dense
-    widths = dense[0].widths if dense else (1, 1, loaded.file.folded[0].hidden)
-    count = count_operations(widths, columns or loaded.columns, loaded.file.folded[0].hidden)
+    count = count_model(loaded.file, columns or loaded.columns)
     if as_json:
         emit_json({**count.as_dict(), "model_crc32": f"{loaded.crc32:08x}"})
         return

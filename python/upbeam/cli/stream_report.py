@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from upbeam.model.baselines import valid_mean
 from upbeam.model.geometry import to_metres, to_points
 from upbeam.model.metrics import GENERATED, FrameMetrics, compare_rows
-from upbeam.power.ops import count_operations
+from upbeam.power.ops import count_model
 from upbeam.power.report import Panel, Picture, plot_birds_eye, plot_close_up, plot_range_images, write_report
 from upbeam.runtime.live import LiveImage, LiveResult
 from upbeam.runtime.upsampler import Model, generated_rows
@@ -58,9 +58,7 @@ def write_stream_report(
 
 
 def _operations(model: Model) -> dict[str, Any]:
-    dense = model.file.dense
-    widths = dense[0].widths if dense else (1, 1, model.file.folded[0].hidden)
-    counts = count_operations(widths, model.columns, model.file.folded[0].hidden).as_dict()
+    counts = count_model(model.file, model.columns).as_dict()
     layers = {
         f"{x['graph']} {x['name']}": f"{x['macs_per_window']} MACs, {x['parameters']} parameters"
         for x in counts.pop("layers")
