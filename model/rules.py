@@ -14,7 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 from .beams import BeamTable, between_rows
 from .network import WINDOW, FoldedNetwork
 
-__all__ = ["BEAMS", "ROWS", "Rules", "RulesError", "Windows", "extract_windows", "upsample_reference"]
+__all__ = [
+    "BEAMS",
+    "ROWS",
+    "Rules",
+    "RulesError",
+    "Windows",
+    "extract_windows",
+    "interleave_rows",
+    "upsample_reference",
+]
 
 BEAMS = 32
 ROWS = 2 * BEAMS
@@ -255,7 +264,8 @@ def upsample_reference(
     unit = rules.distance_unit_m
     generated = generated_counts(networks[0](windows.distance * unit) / unit, windows, rules)
     gi = np.clip(np.floor(networks[1](windows.intensity) + 0.5), 0, 255)
-    return _interleave(d, generated, rules), _interleave(i, np.where(generated > 0, gi, 0).astype(np.uint8), rules)
+    shade = np.where(generated > 0, gi, 0).astype(np.uint8)
+    return interleave_rows(d, generated, rules), interleave_rows(i, shade, rules)
 
 
 def generated_counts(y_counts: FloatArray, windows: Windows, rules: Rules) -> U16:
@@ -267,7 +277,8 @@ def generated_counts(y_counts: FloatArray, windows: Windows, rules: Rules) -> U1
     return np.where(keep, rounded, 0).astype(np.uint16)
 
 
-def _interleave(rows: NDArray[T], generated: NDArray[T], rules: Rules) -> NDArray[T]:
+def interleave_rows(rows: NDArray[T], generated: NDArray[T], rules: Rules) -> NDArray[T]:
+    """Sensor rows ``[n, W]`` and the ``[n - 1, W]`` generated between them -> ``[2 n, W]``."""
     out = np.zeros((2 * rows.shape[0], rows.shape[1]), dtype=rows.dtype)
     out[0::2] = rows
     out[1:-1:2] = generated

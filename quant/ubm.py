@@ -14,10 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from upbeam.model.network import FoldedNetwork, WindowNetwork
 from upbeam.model.rules import BEAMS, ROWS, Rules, RulesError
+
+from .cursor import MAX_WEIGHT, Cursor, UbmError
+from .integer import IntegerModel
+from .ubm_integer import INTEGER_TAGS, pack_integer, parse_integer
 
 __all__ = ["MAX_FILE_BYTES", "ModelFile", "UbmError", "read_ubm", "write_ubm"]
 
@@ -28,7 +31,7 @@ MAX_FILE_BYTES = 1 << 20
 MAX_SECTIONS = 32
 MAX_HIDDEN = 32
 MAX_WIDTH = 64
-MAX_WEIGHT = 1e6
+MAX_SIGNATURE_BYTES = 4096
 REQUIRED = 1
 
 _EDGES = ("zero", "seam")
@@ -37,10 +40,6 @@ _EMPTY = ("none", "fill")
 _INPUTS = ("raw", "difference")
 _OUTPUTS = ("raw", "residual")
 _SENS_BYTES = 64 + 4 * ROWS + 4 * BEAMS + 4 * ROWS + 2 * ROWS
-
-
-class UbmError(ValueError):
-    """A file that is not a sound model: says what is wrong and where."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +51,18 @@ class ModelFile:
     dense: tuple[WindowNetwork, WindowNetwork] | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)
+    int16: IntegerModel | None = None
+    int8: IntegerModel | None = None
+    signature: bytes | None = None
+    """Content of the reserved section ``SIGN``."""
+
+    @property
+    def precisions(self) -> list[str]:
+        """What the file can be run with."""
+        return ["fp32", *(name for name in INTEGER_TAGS if self.integer(name) is not None)]
+
+    def integer(self, precision: str) -> IntegerModel | None:
+        return {"int16": self.int16, "int8": self.int8}[precision]
 
     @classmethod
     def from_dense(cls, rules: Rules, dense: tuple[WindowNetwork, WindowNetwork], **extra: Any) -> ModelFile:
@@ -64,9 +75,15 @@ class ModelFile:
         sections = [(b"SENS", REQUIRED, _pack_sens(self.rules)), (b"NETW", REQUIRED, _pack_netw(self.folded))]
         if self.dense is not None:
             sections.append((b"DENS", 0, _pack_dens(self.dense)))
+        for name, tag in INTEGER_TAGS.items():
+            model = self.integer(name)
+            if model is not None:
+                sections.append((tag.encode(), 0, pack_integer(model, self.rules)))
         for tag, content in ((b"PROV", self.provenance), (b"METR", self.metrics)):
             if content:
                 sections.append((tag, 0, json.dumps(content, sort_keys=True, ensure_ascii=False).encode()))
+        if self.signature is not None:
+            sections.append((b"SIGN", 0, self.signature))
         return _pack_file(sections)
 
 
@@ -182,35 +199,6 @@ def _floats(*arrays: Any) -> bytes:
 # ---------------------------------------------------------------------------------------------------- reading
 
 
-class _Cursor:
-    """Reads a section front to back; every read is bounded by its end."""
-
-    def __init__(self, tag: str, data: bytes) -> None:
-        self.tag, self.data, self.at = tag, data, 0
-
-    def take(self, count: int) -> bytes:
-        if self.at + count > len(self.data):
-            raise UbmError(f"section {self.tag} ends after {len(self.data)} bytes, expected at least {self.at + count}")
-        self.at += count
-        return self.data[self.at - count : self.at]
-
-    def u32(self, what: str, low: int, high: int) -> int:
-        value = int(struct.unpack("<I", self.take(4))[0])
-        if not low <= value <= high:
-            raise UbmError(f"section {self.tag}: {what} is {value}, expected {low} to {high}")
-        return value
-
-    def floats(self, what: str, *shape: int, limit: float = MAX_WEIGHT) -> NDArray[np.float64]:
-        stored = np.frombuffer(self.take(4 * int(np.prod(shape))), dtype="<f4")
-        if not np.all(np.isfinite(stored)) or np.any(np.abs(stored) > np.float32(limit)):
-            raise UbmError(f"section {self.tag}: {what} holds a value that is not finite or beyond +-{limit:g}")
-        return stored.astype(np.float64).reshape(shape)
-
-    def end(self) -> None:
-        if self.at != len(self.data):
-            raise UbmError(f"section {self.tag} has {len(self.data)} bytes, expected {self.at}")
-
-
 def _parse(data: bytes) -> ModelFile:
     sections = _sections(data)
     for tag in ("SENS", "NETW"):
@@ -222,10 +210,13 @@ def _parse(data: bytes) -> ModelFile:
         raise UbmError(f"section SENS: {error}") from None
     return ModelFile(
         rules=rules,
-        folded=_parse_netw(_Cursor("NETW", sections["NETW"])),
-        dense=_parse_dens(_Cursor("DENS", sections["DENS"])) if "DENS" in sections else None,
+        folded=_parse_netw(Cursor("NETW", sections["NETW"])),
+        dense=_parse_dens(Cursor("DENS", sections["DENS"])) if "DENS" in sections else None,
         provenance=_parse_json(sections, "PROV"),
         metrics=_parse_json(sections, "METR"),
+        int16=parse_integer("int16", sections, rules),
+        int8=parse_integer("int8", sections, rules),
+        signature=_parse_signature(sections),
     )
 
 
@@ -237,7 +228,7 @@ def _sections(data: bytes) -> dict[str, bytes]:
     magic, version, header, total, count = struct.unpack_from("<4sHHII", data)
     if magic != MAGIC:
         raise UbmError(f"begins with {magic!r}, expected {MAGIC!r}: not a .ubm model file")
-    if version != VERSION:
+    if version not in (0, 1):
         raise UbmError(f"format version {version}, this program reads version {VERSION}")
     if header != HEADER_BYTES or total != len(data):
         raise UbmError(f"the header speaks of {total} bytes, the file has {len(data)}: truncated or extended")
@@ -275,7 +266,18 @@ def _need_zeros(data: bytes, start: int, end: int) -> None:
         raise UbmError(f"bytes {start} to {end} lie between sections and are not 0")
 
 
-_KNOWN = {"SENS", "NETW", "DENS", "PROV", "METR"}
+_KNOWN = {"SENS", "NETW", "DENS", "PROV", "METR", "SIGN", *INTEGER_TAGS.values()}
+
+
+def _parse_signature(sections: dict[str, bytes]) -> bytes | None:
+    signature = sections.get("SIGN")
+    if signature is None:
+        return None
+    if len(signature) > MAX_SIGNATURE_BYTES:
+        raise UbmError(f"section SIGN has {len(signature)} bytes, at most {MAX_SIGNATURE_BYTES}")
+    if list(sections)[-1] != "SIGN":
+        raise UbmError("section SIGN must be the last one")
+    return signature
 
 
 def _parse_sens(data: bytes) -> Rules:
@@ -325,7 +327,7 @@ def _name(padded: bytes) -> str:
     return name
 
 
-def _parse_netw(cursor: _Cursor) -> tuple[FoldedNetwork, FoldedNetwork]:
+def _parse_netw(cursor: Cursor) -> tuple[FoldedNetwork, FoldedNetwork]:
     cursor.u32("number of networks", 2, 2)
     networks = []
     for _ in range(2):
@@ -352,7 +354,7 @@ def _parse_netw(cursor: _Cursor) -> tuple[FoldedNetwork, FoldedNetwork]:
     return networks[0], networks[1]
 
 
-def _parse_dens(cursor: _Cursor) -> tuple[WindowNetwork, WindowNetwork]:
+def _parse_dens(cursor: Cursor) -> tuple[WindowNetwork, WindowNetwork]:
     cursor.u32("number of networks", 2, 2)
     networks = []
     for _ in range(2):
