@@ -155,7 +155,7 @@ class Rules:
         An image of other than 32 rows is not the sensor's: its rows have no limits of their own."""
         return self.valid(counts) & (counts <= self._row_limits(counts, slice(0, None, 2)))
 
-    def given(self, counts: FloatArray) -> BoolArray:
+    def given(self, counts: FloatArray | NDArray[np.int64]) -> BoolArray:
         """Generated whole counts ``[rows, W]`` that are returns; as for ``seen``."""
         within = (counts >= self.min_count) & (counts <= self.max_count)
         return within & (counts <= self._row_limits(counts, slice(1, -1, 2)))

@@ -18,8 +18,10 @@ from upbeam.model.rules import U8, U16, BoolArray, Rules, RulesError, extract_wi
 
 __all__ = [
     "CONTRACTS",
+    "NETWORK_NAMES",
     "IntegerModel",
     "IntegerNetwork",
+    "NetworkName",
     "OverflowProofError",
     "Precision",
     "Trace",
@@ -32,6 +34,8 @@ __all__ = [
 ]
 
 Precision = Literal["int16", "int8"]
+NetworkName = Literal["distance", "intensity"]
+NETWORK_NAMES: tuple[NetworkName, ...] = ("distance", "intensity")
 CONTRACTS: dict[Precision, str] = {"int16": "upbeam.int16.v1", "int8": "upbeam.int8.v1"}
 
 I64 = NDArray[np.int64]
@@ -199,7 +203,7 @@ def generated_distance(trace: Trace, any_return: BoolArray, rules: Rules) -> U16
 # -------------------------------------------------------------------------------------------------- the proof
 
 
-def largest_inputs(rules: Rules, which: Literal["distance", "intensity"]) -> tuple[int, int]:
+def largest_inputs(rules: Rules, which: NetworkName) -> tuple[int, int]:
     """X and D: the largest input of a network and the largest difference within a window."""
     if which == "intensity":
         return LARGEST_INTENSITY, LARGEST_INTENSITY
@@ -230,7 +234,7 @@ def sum_bounds(n: IntegerNetwork, precision: Precision, largest_input: int, larg
 
     def reach(sign: int) -> I64:
         weights = np.maximum(sign * n.weight, 0).sum(axis=1) * (code << n.k)
-        return sign * (weights + np.maximum(sign * n.minimum, 0) * (largest_input << n.j))
+        return np.asarray(sign * (weights + np.maximum(sign * n.minimum, 0) * (largest_input << n.j)))
 
     low, high = reach(-1) + n.bias, reach(1) + n.bias
     z = [_rectified(round_shift(S, HIDDEN_SHIFT), n.slope) * n.output for S in (low, high)]
@@ -239,7 +243,7 @@ def sum_bounds(n: IntegerNetwork, precision: Precision, largest_input: int, larg
 
 
 def _rectified(a: I64, slope: int) -> I64:
-    return np.maximum(a, round_shift(a * slope, SLOPE_SHIFT))
+    return np.asarray(np.maximum(a, round_shift(a * slope, SLOPE_SHIFT)))
 
 
 def prove(n: IntegerNetwork, precision: Precision, largest_input: int, largest_difference: int, where: str) -> Bounds:

@@ -25,6 +25,7 @@ from .integer import (
     HIDDEN_SHIFT,
     MAX_SHIFT_IN,
     MAX_SHIFT_OUT,
+    NETWORK_NAMES,
     IntegerModel,
     IntegerNetwork,
     OverflowProofError,
@@ -136,15 +137,11 @@ def quantize(
     made: dict[Precision, IntegerModel] = {}
     for precision in precisions:
         networks = []
-        for name, unit, folded, windows in (
-            ("distance", model.rules.distance_unit_m, model.folded[0], calibration.distance),
-            ("intensity", 1.0, model.folded[1], calibration.intensity),
-        ):
-            limits = largest_inputs(model.rules, "distance" if name == "distance" else "intensity")
+        for name, folded in zip(NETWORK_NAMES, model.folded, strict=True):
+            net = difference_network(folded, model.rules.distance_unit_m if name == "distance" else 1.0)
+            windows, limits = getattr(calibration, name), largest_inputs(model.rules, name)
             where = f"{precision} {name} network"
-            networks.append(
-                quantize_network(difference_network(folded, unit), precision, windows, limits, where, rounding=rounding)
-            )
+            networks.append(quantize_network(net, precision, windows, limits, where, rounding=rounding))
         made[precision] = IntegerModel(precision, networks[0], networks[1])
     return replace(model, int16=made.get("int16", model.int16), int8=made.get("int8", model.int8))
 
@@ -211,17 +208,15 @@ class _Plan:
         net = self.net
 
         def reach(sign: int) -> FloatArray:
-            return (
-                np.maximum(sign * net.weight, 0).sum(axis=1) * self.code
-                + np.maximum(sign * net.minimum, 0) * self.limits[0]
-                + np.maximum(sign * net.bias, 0)
-            )
+            differences = np.maximum(sign * net.weight, 0).sum(axis=1) * self.code
+            minimum = np.maximum(sign * net.minimum, 0) * self.limits[0]
+            return np.asarray(differences + minimum + np.maximum(sign * net.bias, 0))
 
         sums = _ROOM * (2.0**31 - 2.0**16) / np.maximum(np.maximum(reach(1), reach(-1)), 1e-30)
         weights = self.largest_weight * 2.0**grid / np.maximum(np.abs(net.weight).max(axis=1), 1e-30)
         minimum = 32766 * 2.0**j / np.maximum(np.abs(net.minimum), 1e-30)
         bias = (2.0**31 - 1) / np.maximum(np.abs(net.bias), 1e-30)
-        return np.minimum.reduce([sums, weights, minimum, bias])
+        return np.asarray(np.minimum.reduce([sums, weights, minimum, bias]))
 
 
 @dataclass

@@ -75,10 +75,10 @@ class ModelFile:
         sections = [(b"SENS", REQUIRED, _pack_sens(self.rules)), (b"NETW", REQUIRED, _pack_netw(self.folded))]
         if self.dense is not None:
             sections.append((b"DENS", 0, _pack_dens(self.dense)))
-        for name, tag in INTEGER_TAGS.items():
+        for name, letters in INTEGER_TAGS.items():
             model = self.integer(name)
             if model is not None:
-                sections.append((tag.encode(), 0, pack_integer(model, self.rules)))
+                sections.append((letters.encode(), 0, pack_integer(model, self.rules)))
         for tag, content in ((b"PROV", self.provenance), (b"METR", self.metrics)):
             if content:
                 sections.append((tag, 0, json.dumps(content, sort_keys=True, ensure_ascii=False).encode()))

@@ -9,14 +9,22 @@ from upbeam.model.network import WINDOW
 from upbeam.model.rules import Rules
 
 from .cursor import Cursor, UbmError
-from .integer import CONTRACTS, IntegerModel, IntegerNetwork, OverflowProofError, Precision, largest_inputs, prove
+from .integer import (
+    CONTRACTS,
+    NETWORK_NAMES,
+    IntegerModel,
+    IntegerNetwork,
+    OverflowProofError,
+    Precision,
+    largest_inputs,
+    prove,
+)
 
 __all__ = ["INTEGER_TAGS", "pack_integer", "parse_integer", "prove_model"]
 
 INTEGER_TAGS: dict[Precision, str] = {"int16": "Q16 ", "int8": "Q8  "}
 
 _NAME_BYTES = 32
-_NETWORKS: tuple[Literal["distance"], Literal["intensity"]] = ("distance", "intensity")
 
 
 def _weight_type(precision: Precision) -> Literal["<i1", "<i2"]:
@@ -25,14 +33,14 @@ def _weight_type(precision: Precision) -> Literal["<i1", "<i2"]:
 
 def prove_model(model: IntegerModel, rules: Rules) -> None:
     """Shows that neither network overflows for any input of these rules. Raises OverflowProofError."""
-    for name, network in zip(_NETWORKS, model, strict=True):
+    for name, network in zip(NETWORK_NAMES, model, strict=True):
         prove(network, model.precision, *largest_inputs(rules, name), f"{model.precision} {name} network")
 
 
 def pack_integer(model: IntegerModel, rules: Rules) -> bytes:
     """The section. A model that could overflow is refused (OverflowProofError)."""
     prove_model(model, rules)
-    out = struct.pack(f"<{_NAME_BYTES}sI", model.contract.encode(), len(_NETWORKS))
+    out = struct.pack(f"<{_NAME_BYTES}sI", model.contract.encode(), len(NETWORK_NAMES))
     narrow = _weight_type(model.precision)
     for n in model:
         out += struct.pack("<6Ii", n.hidden, n.skip, n.slope, n.k, n.j, n.t, n.offset)
@@ -52,7 +60,7 @@ def parse_integer(precision: Precision, sections: dict[str, bytes], rules: Rules
     if contract != CONTRACTS[precision].encode().ljust(_NAME_BYTES, b"\0"):
         raise UbmError(f"section {cursor.tag}: contract {contract!r}, this program knows {CONTRACTS[precision]!r}")
     cursor.u32("number of networks", 2, 2)
-    networks = [_parse_network(cursor, precision) for _ in _NETWORKS]
+    networks = [_parse_network(cursor, precision) for _ in NETWORK_NAMES]
     cursor.end()
     model = IntegerModel(precision, networks[0], networks[1])
     try:
