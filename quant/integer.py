@@ -287,7 +287,7 @@ def _check_parameters(n: IntegerNetwork, precision: Precision, largest: int, dif
     ):
         if not 0 <= value <= top:
             raise OverflowProofError(f"{where}: {name} is {value}, expected 0 to {top}")
-    shifts = (("j", n.j), ("k", n.k)) if precision == "int16" else (("j", n.j),)
-    for name, shift in shifts:
+    inner = n.k if precision == "int16" else max(0, n.k - CODE_BITS)
+    for name, value, shift in (("j", n.j, n.j), ("k", n.k, inner)):
         if largest << shift > 65535:
-            raise OverflowProofError(f"{where}: {name} is {shift}: an input of {largest} then needs more than 16 bits")
+            raise OverflowProofError(f"{where}: {name} is {value}: an input of {largest} then needs more than 16 bits")
