@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -161,12 +162,12 @@ def quantize_network(
     if weight_bits is None:
         weight_bits = 8 if precision == "int8" else 16
     plan = _Plan(net, precision, windows, limits, weight_bits)
-    best = _best_scales(plan)
-    if best is None:
+    found = _best_scales(plan)
+    if not found:
         raise OverflowProofError(f"{where}: no scale makes it fit the contract: weights or biases are too large")
     if rounding == "descent" and weight_bits == 8:
-        best = _descend(plan, best)
-    made = _recentred(plan, best)
+        found = sorted((_descend(plan, one) for one in found), key=lambda one: one.cost)
+    made = _recentred(plan, found[0])
     prove(made, precision, *limits, where)
     return made
 
@@ -221,6 +222,8 @@ class _Plan:
 
 @dataclass
 class _Found:
+    cost: float
+    """Expected squared error of the output, or after descent ``_cost``."""
     weight: I64
     minimum: I64
     bias: I64
@@ -231,22 +234,18 @@ class _Found:
     t: int
 
 
-def _best_scales(plan: _Plan) -> _Found | None:
-    """Tries all shifts; the expected squared error of the output decides."""
-    best: tuple[float, _Found] | None = None
+def _best_scales(plan: _Plan) -> list[_Found]:
+    """Tries all shifts; those with the least expected squared errors of the output, the best first."""
+    found: list[_Found] = []
     j = plan.j()
-    for grid in range(17) if plan.narrow else [plan.j()]:
+    for grid in range(MAX_SHIFT_IN + 1) if plan.narrow else [plan.j()]:
         largest = plan.largest_scales(grid, j)
         for t in range(MAX_SHIFT_OUT + 1):
             scales = _narrow_scales(plan, grid, largest, t) if plan.narrow else _wide_scales(plan, largest, t)
-            if scales is None:
-                continue
-            cost, scale, output = scales
-            if best is None or cost < best[0]:
-                found = _rounded(plan, scale, output, grid, j, t)
-                if _fits(plan, found):
-                    best = cost, found
-    return best[1] if best else None
+            if scales is not None:
+                found.append(_rounded(plan, *scales, grid, j, t))
+    fitting = (one for one in sorted(found, key=lambda one: one.cost) if _fits(plan, one))
+    return list(islice(fitting, _CANDIDATES))
 
 
 def _wide_scales(plan: _Plan, largest: FloatArray, t: int) -> tuple[float, FloatArray, I64] | None:
@@ -283,13 +282,14 @@ def _narrow_scales(plan: _Plan, grid: int, largest: FloatArray, t: int) -> tuple
     return cost, scale, output
 
 
-def _rounded(plan: _Plan, scale: FloatArray, output: I64, grid: int, j: int, t: int) -> _Found:
+def _rounded(plan: _Plan, cost: float, scale: FloatArray, output: I64, grid: int, j: int, t: int) -> _Found:
     net = plan.net
 
     def whole(x: FloatArray) -> I64:
         return np.round(x).astype(np.int64)
 
     return _Found(
+        cost=cost,
         weight=whole(net.weight * scale[:, None] / 2.0**grid),
         minimum=whole(net.minimum * scale / 2.0**j),
         bias=whole(net.bias * scale),
@@ -348,6 +348,8 @@ def _cost(error: FloatArray) -> float:
     return float(np.abs(error).mean() + 0.05 * np.sqrt((error**2).mean()))
 
 
+_CANDIDATES = 4
+"""Pairs of shifts that descent starts from."""
 _PASSES = 6
 _SMALL_STEPS = {"bias": (1 << 12, 1 << 15, 1 << 17), "minimum": (1, 8, 64)}
 
@@ -389,4 +391,5 @@ def _descend(plan: _Plan, f: _Found) -> _Found:
                     array[place] -= step
         if best > before * 0.999:
             break
+    f.cost = best
     return f

@@ -24,7 +24,7 @@ def model():
 def simulated(model, seed: int, frames: int = 3) -> Calibration:
     recipe = load_recipe("default")
     sources = (replace(recipe.data[0], frames=frames, seed=seed),)
-    return calibration_windows(recipe_frames(recipe, model.rules, sources), model.rules, 20_000)
+    return calibration_windows(recipe_frames(recipe, model.rules, sources), model.rules, 8_000)
 
 
 @pytest.fixture(scope="module")
