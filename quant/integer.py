@@ -270,9 +270,9 @@ def prove(n: IntegerNetwork, precision: Precision, largest_input: int, largest_d
 def _check_parameters(n: IntegerNetwork, precision: Precision, largest: int, difference: int, where: str) -> None:
     narrow = 8 if precision == "int8" else 16
     for name, values, bits in (("W", n.weight, narrow), ("V", n.output, narrow), ("M", n.minimum, 16)):
-        limit = 2 ** (bits - 1) - 1
-        if np.any(np.abs(values) > limit):
-            raise OverflowProofError(f"{where}: {name} reaches {np.abs(values).max()}, at most {limit} fits")
+        limit = 2 ** (bits - 1)
+        if np.any(values < -limit) or np.any(values >= limit):
+            raise OverflowProofError(f"{where}: {name} is {values.min()} to {values.max()}, beyond {bits} bits")
     for name, values in (("B", n.bias), ("C", np.array([n.offset]))):
         if np.any(values < -(2**31)) or np.any(values >= 2**31):
             raise OverflowProofError(f"{where}: {name} does not fit 32 bits")

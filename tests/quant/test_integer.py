@@ -150,13 +150,13 @@ def test_no_input_leaves_the_proven_bounds_and_some_reach_them(precision, rng):
     [
         ({"weight": np.full((1, 6), 32767)}, r"test: the sum S of hidden unit 0 can reach 0 to \d+, beyond 32 bits"),
         ({"bias": np.array([2**31 - 1])}, "the sum S of hidden unit 0"),
-        ({"weight": np.full((1, 6), 40_000)}, "W reaches 40000, at most 32767 fits"),
+        ({"weight": np.full((1, 6), 40_000)}, "W is 40000 to 40000, beyond 16 bits"),
         ({"offset": 2**30}, r"the output Y can reach .*beyond 31 bits"),
         ({"t": 25}, "t is 25, expected 0 to 24"),
         ({"j": 1}, "j is 1: an input of 40000 then needs more than 16 bits"),
         ({"k": 1}, "k is 1: an input of 40000"),
         ({"slope": 32768}, "slope is 32768"),
-        ({"minimum": np.array([-40_000])}, "M reaches 40000"),
+        ({"minimum": np.array([-40_000])}, "M is -40000 to -40000, beyond 16 bits"),
         ({"offset": 2**31}, "C does not fit"),
     ],
 )

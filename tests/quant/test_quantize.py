@@ -45,7 +45,7 @@ def error_mm(net, made, precision, windows, unit_m) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("precision", "bits", "mean_mm", "p999_mm"), [("int16", 16, 2.5, 12), ("int16", 8, 6, 120), ("int8", 8, 8, 250)]
+    ("precision", "bits", "mean_mm", "p999_mm"), [("int16", 16, 2.5, 12), ("int16", 8, 6, 200), ("int8", 8, 8, 250)]
 )
 def test_distance_error_on_unseen_windows(model, calibration, unseen, precision, bits, mean_mm, p999_mm):
     net = difference_network(model.folded[0], model.rules.distance_unit_m)
