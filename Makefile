@@ -7,7 +7,7 @@ NATIVE := CMakeLists.txt $(shell find kernels/cpu runtime -name '*.[ch]' -o -nam
 SHELL  := bash
 SHARED := $(firstword $(wildcard ../shared/data))
 
-.PHONY: help setup demo test test-c test-c-all test-train lint bench soak dist model stubs clean
+.PHONY: help setup demo test test-c test-c-all test-train lint bench soak dist model stubs accuracy clean
 .DELETE_ON_ERROR:
 
 help:
@@ -19,6 +19,7 @@ help:
 	@echo "make bench       kernel tests and benchmarks"
 	@echo "make soak        the long runs (about 15 minutes)"
 	@echo "make model       train the shipped model anew"
+	@echo "make accuracy    every method beside every other (trains what is not shipped: half an hour)"
 	@echo "make clean       remove everything built"
 
 setup: $(VENV)/.installed
@@ -108,3 +109,25 @@ stubs: $(VENV)/.installed
 
 clean:
 	rm -rf $(VENV) build dist
+
+# Every method beside every other: trains what is not shipped (once), then prints the tables of docs/accuracy.md.
+DATA     := $(or $(UPBEAM_DATA),$(SHARED))
+FRAMES   := $(wildcard $(DATA)/kitti/frames)
+TRAINED  := build/accuracy/$(if $(FRAMES),kitti,simulated)
+BESIDE    = --with $(TRAINED)/paper-ring.ubm --with $(TRAINED)/shan-small.pt
+
+$(TRAINED)/%.ubm: model/recipes/%.yaml | $(VENV)/.train
+	@mkdir -p $(@D)
+	UPBEAM_DATA=$(DATA) $(BIN)/upbeam train --recipe $* --out $@ $(if $(FRAMES),,--simulated 16)
+
+$(TRAINED)/%.pt: model/recipes/%.yaml | $(VENV)/.train
+	@mkdir -p $(@D)
+	UPBEAM_DATA=$(DATA) $(BIN)/upbeam train --recipe $* --out $@ $(if $(FRAMES),,--simulated 16)
+
+accuracy: $(TRAINED)/paper-ring.ubm $(TRAINED)/shan-small.pt $(if $(FRAMES),$(TRAINED)/paper-small.ubm)
+ifneq ($(FRAMES),)
+	$(BIN)/upbeam evaluate $(FRAMES) --drive drive-a $(BESIDE)
+	$(BIN)/upbeam evaluate $(FRAMES) --drive drive-a --rows elevation $(BESIDE) --with $(TRAINED)/paper-small.ubm
+else
+	$(BIN)/upbeam evaluate sim --frames 10 $(BESIDE)
+endif

@@ -137,7 +137,7 @@ def draw_pareto(path: Path, points: Sequence[Point]) -> None:
 def _draw_metric(axes: Axes, metric: str, points: Sequence[Point]) -> None:
     kinds = {
         "no network": ("s", "#1b1b1b", [p for p in points if p.method in SIMPLE]),
-        "ours, trained on the simulator": ("o", "#e8710a", [p for p in points if _ours(p)]),
+        "ours by hidden units, trained on the simulator": ("o", "#e8710a", [p for p in points if _ours(p)]),
         "the paper's network, trained on 16 of these frames": ("D", "#4c78a8", [p for p in points if _papers(p)]),
     }
     for label, (marker, colour, chosen) in kinds.items():
@@ -147,11 +147,15 @@ def _draw_metric(axes: Axes, metric: str, points: Sequence[Point]) -> None:
         axes.errorbar(x, y[0], [y[0] - y[1], y[2] - y[0]], fmt=marker, color=colour, capsize=4, label=label)
         if label.startswith("ours"):
             axes.plot(x, y[0], color=colour, linewidth=0.8, alpha=0.5)
-        for point, value in zip(chosen, y[0], strict=True):
-            axes.annotate(_name(point), (point.multiply_adds, value), xytext=(7, 5), textcoords="offset points")
+        for point, value, low in zip(chosen, y[0], y[1], strict=True):
+            below = _ours(point)  # where no other point's bar is
+            place, shift = (low, (0, -14)) if below else (value, (8, -13 if point.method == "edge-aware" else 5))
+            where = {"xytext": shift, "textcoords": "offset points", "ha": "center" if below else "left"}
+            axes.annotate(_name(point), (point.multiply_adds, place), **where)
     axes.axhline(1, color="#9aa0a6", linewidth=0.8, linestyle="--", zorder=0)
     axes.set(title=TITLES[metric], xlabel="multiply-adds per window (folded)", ylabel="ratio to valid-mean")
     axes.set_xlim(-6, 128)
+    axes.margins(y=0.1)
     axes.set_xticks([0, *sorted({point.multiply_adds for point in points if point.multiply_adds})])
     axes.grid(axis="y", color="#d9d9d9", linewidth=0.5)
     if metric == "chamfer":
@@ -168,7 +172,7 @@ def _ours(point: Point) -> bool:
 
 def _name(point: Point) -> str:
     """Ours by their hidden units: 8 multiply-adds each."""
-    return f"{point.multiply_adds // 8} hidden" if _ours(point) else point.method
+    return str(point.multiply_adds // 8) if _ours(point) else point.method
 
 
 if __name__ == "__main__":

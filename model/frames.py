@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +14,16 @@ from .geometry import GeometryError, IndexArray, RangeImage, bin_elevation, elev
 from .io import Cloud, CloudError, read_cloud
 from .rules import ROWS, Rules
 
-__all__ = ["Frame", "RowRule", "bin_elevation_deg", "image_of_cloud", "kitti_files", "kitti_frames"]
+__all__ = [
+    "Frame",
+    "RowRule",
+    "bin_elevation_deg",
+    "every_other_row",
+    "image_of_cloud",
+    "in_counts_of",
+    "kitti_files",
+    "kitti_frames",
+]
 
 RowRule = Literal["ring", "elevation"]
 
@@ -68,6 +77,34 @@ class Frame:
     def given(self) -> slice:
         """The rows that methods see."""
         return slice(0, None, 2)
+
+
+def every_other_row(frame: Frame) -> Frame:
+    """The given rows alone, as a sensor of half the beams would have recorded them."""
+    rows = frame.given
+    return replace(
+        frame,
+        distance=frame.distance[rows],
+        intensity=frame.intensity[rows],
+        elevation_deg=frame.elevation_deg[rows],
+        row_height_m=frame.row_height_m[rows],
+        surface=None if frame.surface is None else frame.surface[rows],
+    )
+
+
+def in_counts_of(frame: Frame, distance_unit_m: float) -> Frame:
+    """The frame with distances in counts of another unit, rounded half up; beyond 65535 there is no return."""
+    if frame.distance_unit_m == distance_unit_m:
+        return frame
+    counts = np.floor(frame.distance * (frame.distance_unit_m / distance_unit_m) + 0.5)
+    fits = (counts > 0) & (counts <= 65535)
+    return replace(
+        frame,
+        distance=np.where(fits, counts, 0).astype(np.uint16),
+        intensity=np.where(fits, frame.intensity, 0).astype(np.uint8),
+        distance_unit_m=distance_unit_m,
+        surface=None if frame.surface is None else np.where(fits, frame.surface, 0).astype(np.uint8),
+    )
 
 
 def bin_elevation_deg(top_deg: float = 2.0, bottom_deg: float = -24.9, rows: int = ROWS) -> NDArray[np.float64]:

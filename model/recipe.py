@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from importlib import resources
 from pathlib import Path
@@ -18,14 +18,21 @@ from .rules import ROWS, Rules
 
 __all__ = [
     "NETWORKS",
+    "AnyRecipe",
+    "BaseRecipe",
     "DataRecipe",
     "Loss",
     "NetworkRecipe",
     "Recipe",
     "RecipeError",
     "TrainingRecipe",
+    "UNetRecipe",
+    "UNetTraining",
+    "load_any_recipe",
     "load_recipe",
     "recipe_names",
+    "with_length",
+    "with_simulated_data",
 ]
 
 NETWORKS = ("distance", "intensity")
@@ -70,6 +77,9 @@ class NetworkRecipe:
     scale: float
     relu_in_loss: bool = False
     """The loss sees ``max(y, 0)``, as the paper trains; else y itself, so that a negative output has a gradient."""
+    scale_free: bool = False
+    """No biases, and the minimum is no feature. With differences in and a residual out, inputs times k then give the
+    output times k, and inputs plus c the output plus c: nothing lies outside what was trained on."""
 
     @property
     def exportable(self) -> bool:
@@ -102,6 +112,8 @@ class TrainingRecipe:
     alike, and the simulator's are more alike than real ones. The natural logarithm's standard deviation."""
     intensity_noise: float = 0.0
     """The same for every pixel on its own."""
+    validate_every: int = 1
+    """Entries of the log (an epoch, or 50 steps where that is less) between two losses on the validation frames."""
 
     def loss(self, network: str) -> Loss:
         return self.distance_loss if network == "distance" else self.intensity_loss
@@ -112,9 +124,9 @@ class TrainingRecipe:
 
 @dataclass(frozen=True)
 class DataRecipe:
-    source: Literal["simulator", "kitti"]
+    source: Literal["simulator", "kitti", "capture"]
     frames: int = 0
-    """Of ``kitti``: at most so many, 0 for all."""
+    """Of ``kitti`` and ``capture``: at most so many, 0 for all."""
     seed: int = 0
     frames_per_scene: int = 1
     projection: Literal["aligned", "recorded"] = "aligned"
@@ -132,10 +144,23 @@ class DataRecipe:
     only_drives: tuple[str, ...] = ()
     """Of ``kitti``: only frames of these drives of the folder's ``drives.tsv``."""
     without_drives: tuple[str, ...] = ()
+    path: str = ""
+    """Of ``capture``: a .pcap file or a ROS 2 bag's .db3, from here or from the folder UPBEAM_DATA names."""
+    sensor: str = ""
+    """Of ``capture``: which one, where it holds packets of several."""
+    hide: Literal["every-other", "three-of-four"] = "every-other"
+    """Of ``capture``: which beams are the truth. ``every-other``: half of all are given, half hidden: gaps twice the
+    sensor's. ``three-of-four``: of every other beam only, so that 128 beams train what 64 rows made of 32 need."""
+    licence: str = ""
+    """Of ``capture``: of the recording; it stands in the model's provenance."""
+    may_ship: bool = False
+    """Of ``capture``: the licence allows weights trained on it to be shipped under ours. Needs ``licence``."""
 
 
-@dataclass(frozen=True)
-class Recipe:
+@dataclass(frozen=True, kw_only=True)
+class BaseRecipe:
+    """Sensor, rules and frames: what every kind of training needs."""
+
     name: str
     seed: int
     beams: str
@@ -143,15 +168,11 @@ class Recipe:
     columns: int
     rules: dict[str, Any]
     data: tuple[DataRecipe, ...]
-    networks: dict[str, NetworkRecipe]
-    training: TrainingRecipe
-    windows: int = 0
-    """Windows drawn from all frames, for both networks, where ``training.batch`` counts windows."""
     rows: RowRule = "ring"
     aligned: bool = True
     """Columns of the model's sensor come azimuth aligned, as recordings are; else as the lasers fire."""
     validation: tuple[DataRecipe, ...] = ()
-    """Frames the result is judged on; never trained on."""
+    """Frames the result, and the loss on the way, is judged on; never trained on."""
 
     def simulated_beams(self) -> BeamTable:
         return beam_table(self.beams)
@@ -169,13 +190,56 @@ class Recipe:
         return replace(table, name=f"elevation-{ROWS}", elevation_deg=np.asarray(bin_elevation_deg()))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Recipe(BaseRecipe):
+    """Of the two window networks."""
+
+    networks: dict[str, NetworkRecipe]
+    training: TrainingRecipe
+    windows: int = 0
+    """Windows drawn from all frames, for both networks, where ``training.batch`` counts windows."""
+
+
+@dataclass(frozen=True)
+class UNetTraining:
+    """Of Shan's U-Net (``shan.train_shan``)."""
+
+    width: float
+    """Its filters as a share of the published ones."""
+    steps: int
+    batch: int = 4
+    """Crops a step."""
+    crop_columns: int = 256
+    learning_rate: float = 0.001
+    """Adam's, with cosine decay to 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UNetRecipe(BaseRecipe):
+    """Of the U-Net of Shan et al. 2020: a baseline, never a model to ship."""
+
+    unet: UNetTraining
+
+
+AnyRecipe = Recipe | UNetRecipe
+
+
 def recipe_names() -> list[str]:
     folder = resources.files(__package__).joinpath("recipes")
     return sorted(p.name.removesuffix(".yaml") for p in folder.iterdir() if p.name.endswith(".yaml"))
 
 
 def load_recipe(name: str | Path) -> Recipe:
-    """A shipped recipe by name, or a YAML file. Raises RecipeError."""
+    """A shipped recipe of window networks by name, or a YAML file. Raises RecipeError."""
+    recipe = load_any_recipe(name)
+    if not isinstance(recipe, Recipe):
+        raise RecipeError(f"recipe {name}: trains a U-Net, not the two window networks")
+    return recipe
+
+
+def load_any_recipe(name: str | Path) -> AnyRecipe:
+    """A shipped recipe by name, or a YAML file: of the window networks, or (key ``unet``) of Shan's U-Net. Raises
+    RecipeError."""
     path = Path(name)
     if path.suffix in {".yaml", ".yml"}:
         try:
@@ -198,8 +262,55 @@ def load_recipe(name: str | Path) -> Recipe:
     return recipe
 
 
-def _recipe(raw: Any, where: str) -> Recipe:
+def with_simulated_data(recipe: R, frames: int) -> R:
+    """The recipe on ``frames`` simulated frames, validated on half as many others, whatever its own data is: for who
+    has no recordings."""
+    projection: Literal["aligned", "recorded"] = "recorded" if recipe.rows == "elevation" else "aligned"
+    source = DataRecipe("simulator", frames=frames, seed=5000, projection=projection)
+    return replace(recipe, data=(source,), validation=(replace(source, frames=max(1, frames // 2), seed=6000),))
+
+
+def with_length(recipe: AnyRecipe, *, epochs: int | None = None, steps: int | None = None) -> AnyRecipe:
+    """The recipe with other ``epochs`` (of the distance network; the intensity network's change in proportion, to at
+    least 1) or ``steps``. Raises RecipeError where it does not count in these."""
+    if isinstance(recipe, UNetRecipe):
+        counts, own_steps = False, recipe.unet.steps
+    else:
+        counts, own_steps = recipe.training.epochs_of("distance") > 0, recipe.training.steps
+    if (epochs is not None and not counts) or (steps is not None and own_steps == 0):
+        raise RecipeError(f"recipe {recipe.name} counts {'epochs' if counts else 'steps'}")
+    if isinstance(recipe, UNetRecipe):
+        return recipe if steps is None else replace(recipe, unet=replace(recipe.unet, steps=steps))
+    if steps is not None:
+        return replace(recipe, training=replace(recipe.training, steps=steps))
+    if epochs is None:
+        return recipe
+    share = epochs / recipe.training.epochs_of("distance")
+    lengths = {name: max(1, round(share * recipe.training.epochs_of(name))) for name in NETWORKS}
+    return replace(recipe, training=replace(recipe.training, epochs=lengths))
+
+
+def _recipe(raw: Any, where: str) -> AnyRecipe:
     top = _mapping(raw, where)
+    parts: dict[str, Any] = {
+        "data": _sources(top.get("data"), f"{where}: data"),
+        "validation": _sources(top["validation"], f"{where}: validation") if "validation" in top else (),
+    }
+    recipe: AnyRecipe
+    problems: Iterable[str]
+    if "unet" in top:
+        unet = _build(UNetTraining, top["unet"], f"{where}: unet")
+        recipe = _build(UNetRecipe, {**top, **parts, "unet": unet}, where)
+        problems = _wrong_unet(recipe.unet)
+    else:
+        recipe = _build(Recipe, {**top, **parts, **_network_parts(top, where)}, where)
+        problems = (*_wrong_numbers(recipe), *_contradictions(recipe))
+    for problem in (*problems, *_wrong_sources(recipe)):
+        raise RecipeError(f"{where}: {problem}")
+    return recipe
+
+
+def _network_parts(top: dict[str, Any], where: str) -> dict[str, Any]:
     networks = _mapping(top.get("networks"), f"{where}: networks")
     training = dict(_mapping(top.get("training"), f"{where}: training"))
     if set(networks) != set(NETWORKS):
@@ -208,16 +319,10 @@ def _recipe(raw: Any, where: str) -> Recipe:
         )
     for key in ("distance_loss", "intensity_loss"):
         training[key] = _build(Loss, training.get(key), f"{where}: training.{key}")
-    parts = {
+    return {
         "networks": {k: _network(v, f"{where}: networks.{k}") for k, v in networks.items()},
         "training": _build(TrainingRecipe, training, f"{where}: training"),
-        "data": _sources(top.get("data"), f"{where}: data"),
-        "validation": _sources(top["validation"], f"{where}: validation") if "validation" in top else (),
     }
-    recipe = _build(Recipe, {**top, **parts}, where)
-    for problem in (*_wrong_numbers(recipe), *_contradictions(recipe)):
-        raise RecipeError(f"{where}: {problem}")
-    return recipe
 
 
 def _sources(raw: Any, where: str) -> tuple[DataRecipe, ...]:
@@ -249,24 +354,14 @@ def _wrong_numbers(recipe: Recipe) -> Iterator[str]:
     positive: dict[str, Any] = {
         "training.learning_rate": training.learning_rate,
         "training.patience": training.patience,
+        "training.validate_every": training.validate_every,
     }
     for key, loss in (("distance_loss", training.distance_loss), ("intensity_loss", training.intensity_loss)):
         for name in ("knee_m", "scale_m", "power", "search_rows", "search_columns"):
             positive[f"training.{key}.{name}"] = getattr(loss, name)
     for key, network in recipe.networks.items():
         positive[f"networks.{key}.scale"] = network.scale
-    for key, sources in (("data", recipe.data), ("validation", recipe.validation)):
-        for k, source in enumerate(sources):
-            positive |= {
-                f"{key}[{k}].{n}": getattr(source, n) for n in ("firing_columns", "rate_hz", "frames_per_scene")
-            }
-            if source.source == "simulator":
-                positive[f"{key}[{k}].frames"] = source.frames
-            if source.columns and not 4 <= source.columns <= 65535:
-                yield f"{key}[{k}].columns is {source.columns!r}, expected 4 to 65535, or 0 for the recipe's"
-    for key, value in positive.items():
-        if not 0 < value < float("inf"):
-            yield f"{key} is {value!r}, expected a number above 0"
+    yield from _not_positive(positive)
     if not 1 <= training.starts <= 64:
         yield f"training.starts is {training.starts!r}, expected 1 to 64"
     for name in ("intensity_gain", "intensity_noise"):
@@ -296,12 +391,53 @@ def _contradictions(recipe: Recipe) -> Iterator[str]:
             yield f"training.{key} looks at whole images: it needs training.batch_images instead of training.batch"
     if training.intensity_loss.kind == "chamfer":
         yield "training.intensity_loss.kind is chamfer, which only distances have"
-    for source in (*recipe.data, *recipe.validation):
-        if recipe.rows == "elevation" and source.source == "simulator" and source.projection != "recorded":
-            yield "rows: elevation needs projection: recorded of a simulator source"
+
+
+def _wrong_unet(unet: UNetTraining) -> Iterator[str]:
+    keys = ("width", "steps", "batch", "crop_columns", "learning_rate")
+    yield from _not_positive({f"unet.{key}": getattr(unet, key) for key in keys})
+    if unet.width > 4:
+        yield f"unet.width is {unet.width!r}, expected 4 at most"
+
+
+def _wrong_sources(recipe: BaseRecipe) -> Iterator[str]:
+    for key, sources in (("data", recipe.data), ("validation", recipe.validation)):
+        for k, source in enumerate(sources):
+            for problem in _wrong_source(source, recipe):
+                yield f"{key}[{k}]{problem}"
+
+
+def _wrong_source(source: DataRecipe, recipe: BaseRecipe) -> Iterator[str]:
+    """Begins with the key, or a colon."""
+    positive = {f".{name}": getattr(source, name) for name in ("firing_columns", "rate_hz", "frames_per_scene")}
+    if source.source == "simulator":
+        positive[".frames"] = source.frames
+    yield from _not_positive(positive)
+    if source.columns and not 4 <= source.columns <= 65535:
+        yield f".columns is {source.columns!r}, expected 4 to 65535, or 0 for the recipe's"
+    if recipe.rows == "elevation" and source.source == "simulator" and source.projection != "recorded":
+        yield ": rows: elevation needs projection: recorded of a simulator source"
+    if source.source != "capture":
+        given = [n for n in ("path", "sensor", "licence", "may_ship") if getattr(source, n)]
+        if given:
+            yield f".{given[0]} is of source: capture, this one is {source.source}"
+        return
+    if not source.path:
+        yield ".path names no capture: expected a .pcap or .db3 file"
+    if source.may_ship and not source.licence:
+        yield ".may_ship needs the recording's licence"
+    if recipe.rows == "elevation":
+        yield ": rows: elevation is KITTI's binning; a capture has rows of its own"
+
+
+def _not_positive(values: Mapping[str, Any]) -> Iterator[str]:
+    for key, value in values.items():
+        if not 0 < value < float("inf"):
+            yield f"{key} is {value!r}, expected a number above 0"
 
 
 T = TypeVar("T")
+R = TypeVar("R", bound=BaseRecipe)
 
 
 def _build(kind: type[T], raw: Any, where: str) -> T:

@@ -18,18 +18,19 @@ from dataclasses import dataclass
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from .beams import BeamTable, beam_table
-from .frames import Frame
+from .frames import Frame, every_other_row, in_counts_of
 from .geometry import DEFAULT_CUT_DEG, GeometryError, azimuth_deg, project
 from .io import MAX_FILE_BYTES, CloudError
+from .rules import BEAMS, Rules
 
-__all__ = ["Capture", "CaptureStats", "capture_frames", "open_capture"]
+__all__ = ["Capture", "CaptureStats", "capture_frames", "open_capture", "training_frames"]
 
 FloatArray = NDArray[np.float64]
 Source = tuple[str, str]
@@ -54,6 +55,8 @@ NEAR_DEG = 15.0
 """Beyond a packet's first azimuth, what its points may reach: laser offsets (6.4) and the packet's own sweep."""
 WHOLE_TOLERANCE_DEG = 3.6
 """A turn that lacks less than this at its beginning or end is whole: a hundredth of a turn."""
+SAME_BEAM_DEG = 0.3
+"""Elevations of one sensor's table and another's that are taken for the same beam."""
 MAX_STEP = 500
 """Between the blocks of a packet, in 0.01 degrees: far above any sensor's (0.8 degrees)."""
 _HOUR_US = 3_600_000_000
@@ -187,6 +190,36 @@ def capture_frames(
         what = f"no whole turn, {capture.stats.partial_turns} partial"
         raise CloudError(path, what, "capture", f"a whole turn from {cut_deg:g} degrees on (or partial turns allowed)")
     return capture.frames(columns, partial=partial)
+
+
+def training_frames(
+    capture: Capture,
+    rules: Rules,
+    *,
+    columns: int | None = None,
+    hide: Literal["every-other", "three-of-four"] = "every-other",
+) -> Iterator[Frame]:
+    """The whole turns in counts of ``rules``, to train on: even rows given, odd rows the truth.
+
+    ``every-other`` hides half of the beams; ``three-of-four`` looks at every other beam alone and hides half of these.
+    Raises CloudError without a whole turn, and where 32 rows are given that are not those of ``rules``, whose range
+    limits by row would then cut returns of other elevations.
+    """
+    if not capture.stats.turns:
+        what = f"no whole turn, {capture.stats.partial_turns} partial"
+        raise CloudError(capture.path, what, "capture", "a whole turn to train on")
+    for frame in capture.frames(columns):
+        seen = every_other_row(frame) if hide == "three-of-four" else frame
+        _check_row_limits(capture.path, seen, rules)
+        yield in_counts_of(seen, rules.distance_unit_m)
+
+
+def _check_row_limits(path: Path, frame: Frame, rules: Rules) -> None:
+    given, own = frame.elevation_deg[frame.given], rules.row_elevation_deg[0::2]
+    limited = bool(np.any(rules.row_max_count < rules.max_count))
+    if limited and len(given) == BEAMS and np.max(np.abs(given - own)) > SAME_BEAM_DEG:
+        what = f"the 32 given beams are not those of {rules.sensor}, whose rows have range limits of their own"
+        raise CloudError(path, what, "beams", "rules without such limits (ground_reach: 0), or that sensor")
 
 
 # ---------------------------------------------------------------------------------------------------- reading packets

@@ -9,15 +9,18 @@ of transposed convolutions with skip connections; one convolution without normal
 
 Assumed, where that leaves it open or the task differs: distances are divided by 80 m (our range limit); dropout of 0.25
 after each block but the first and the last; twice the rows instead of four times, so one transposed convolution instead
-of two; the output passes a ReLU; columns beyond the image are 0. The network makes ranges only: intensities are those
-of the valid-neighbour mean.
+of two; the output passes a ReLU; columns beyond the image are 0; the learning rate decays to 0 along a cosine. The
+network makes ranges only: intensities are those of the valid-neighbour mean.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +32,17 @@ from .frames import Frame
 from .network import NetworkError
 from .rules import Rules
 
-__all__ = ["ShanNet", "load_shan", "shan_method", "train_shan", "uncertain_removed"]
+__all__ = [
+    "PASSES",
+    "UNCERTAIN",
+    "ShanNet",
+    "is_shan",
+    "load_shan",
+    "save_shan",
+    "shan_method",
+    "train_shan",
+    "uncertain_removed",
+]
 
 U16 = NDArray[np.uint16]
 U8 = NDArray[np.uint8]
@@ -38,10 +51,14 @@ FULL_SCALE_M = 80.0
 """What the network sees as 1."""
 FILTERS = (64, 128, 256, 512, 1024)
 DROPOUT = 0.25
+PASSES = 50
 UNCERTAIN = 0.03
 """A pixel is removed where the passes' standard deviation is above this share of their mean."""
 _TILE = 2 ** (len(FILTERS) - 1)
 """Rows and columns are padded to a multiple of this, for the poolings."""
+LOG_STEPS = 25
+Progress = Callable[[int, int, float, float | None], None]
+"""(step, steps, mean training loss since the call before, loss on the validation frames or None), in units of 80 m"""
 
 
 class ShanNet(nn.Module):
@@ -84,7 +101,8 @@ class ShanNet(nn.Module):
         """``[count, 2 B, W]`` of one image ``[B, W]`` / 80 m, each with other units dropped; the same for a seed."""
         self.eval()
         self.dropout.train()  # always on; batch normalisation stays as trained
-        with torch.random.fork_rng(devices=[]), torch.no_grad():
+        image = image.to(self.output.weight.device)
+        with _own_random_numbers(image.device), torch.no_grad():
             torch.manual_seed(seed)
             return torch.stack([self(image[None, None])[0, 0] for _ in range(count)])
 
@@ -104,10 +122,36 @@ def uncertain_removed(passes: NDArray[np.float32], share: float = UNCERTAIN) -> 
     return np.where(values.std(axis=0) > share * mean, 0.0, mean)
 
 
-def load_shan(path: str | Path) -> ShanNet:
-    """A network from a ``.pt`` ``state_dict`` of ``ShanNet``, its width read off the weights. Raises NetworkError."""
+def _own_random_numbers(device: torch.device) -> Any:
+    """Random numbers drawn inside leave those of the caller alone."""
+    return torch.random.fork_rng(devices=[device] if device.type == "cuda" else [])
+
+
+def save_shan(path: str | Path, network: ShanNet, provenance: Mapping[str, Any] | None = None) -> None:
+    """Weights, and where they come from, as a ``.pt`` file of tensors and text."""
+    state = {key: value.cpu() for key, value in network.state_dict().items()}
+    torch.save({"shan": state, "provenance": json.dumps(dict(provenance or {}))}, path)
+
+
+def is_shan(path: str | Path) -> bool:
+    """Whether a ``.pt`` file holds weights of a ``ShanNet``; False also for a file that cannot be read."""
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        return "first.0.bias" in _state(path)
+    except Exception:
+        return False
+
+
+def _state(path: str | Path) -> Mapping[str, Any]:
+    saved: Mapping[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    state: Mapping[str, Any] = saved.get("shan", saved)
+    return state
+
+
+def load_shan(path: str | Path) -> ShanNet:
+    """A network from what ``save_shan`` wrote, or a ``.pt`` ``state_dict``, its width read off the weights. Raises
+    NetworkError."""
+    try:
+        state = _state(path)
         network = ShanNet(len(state["first.0.bias"]) / FILTERS[0])
         network.load_state_dict(state)
     except Exception as error:
@@ -115,9 +159,9 @@ def load_shan(path: str | Path) -> ShanNet:
     return network
 
 
-def shan_method(weights: str | Path | ShanNet, passes: int = 50, seed: int = 0) -> Method:
-    """The network behind the interface of the baselines. ``passes`` >= 2; the same seed gives the same points on the
-    CPU of one machine."""
+def shan_method(weights: str | Path | ShanNet, passes: int = PASSES, seed: int = 0) -> Method:
+    """The network behind the interface of the baselines, on the device it is on. ``passes`` >= 2; the same seed gives
+    the same points on the CPU of one machine."""
     if passes < 2:
         raise ValueError(f"{passes} passes: a standard deviation needs 2 or more")
     network = weights if isinstance(weights, ShanNet) else load_shan(weights)
@@ -125,7 +169,7 @@ def shan_method(weights: str | Path | ShanNet, passes: int = 50, seed: int = 0) 
     def run(distance: U16, intensity: U8, rules: Rules) -> tuple[U16, U8]:
         scale = rules.distance_unit_m / FULL_SCALE_M
         image = torch.from_numpy(np.where(rules.valid(distance), distance * scale, 0).astype(np.float32))
-        metres = uncertain_removed(network.passes(image, passes, seed).numpy())[1:-1:2] * FULL_SCALE_M
+        metres = uncertain_removed(network.passes(image, passes, seed).cpu().numpy())[1:-1:2] * FULL_SCALE_M
         counts = np.floor(metres / rules.distance_unit_m + 0.5)
         keep = (counts >= rules.min_count) & (counts <= rules.max_count)
         grey = valid_mean(distance, intensity, rules)[1]
@@ -144,33 +188,73 @@ def train_shan(
     batch: int = 4,
     learning_rate: float = 1e-3,
     seed: int = 0,
+    validation: Sequence[Frame] = (),
+    progress: Progress = lambda *_: None,
+    device: torch.device | None = None,
 ) -> ShanNet:
-    """Fits a network on crops of frames of equal rows, on one CPU thread: L1 over the rows that have a truth, an empty
-    pixel being 0. The same arguments give the same bits on one machine."""
+    """Fits a network on crops of frames of equal rows: L1 over the rows that have a truth, an empty pixel being 0.
+
+    One thread on the CPU, where the same arguments give the same bits on one machine. ``progress`` is called every 25
+    steps; the loss on ``validation`` (one crop of each frame, nothing dropped) changes nothing of the weights. The
+    network stays on ``device``.
+    """
     if not frames:
         raise ValueError("no frames to train on")
+    device = device or torch.device("cpu")
     rng = np.random.default_rng(seed)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with torch.random.fork_rng(devices=[]):
+        with _own_random_numbers(device):
             torch.manual_seed(seed)
-            network = ShanNet(width).train()
+            network = ShanNet(width).to(device).train()
+            held = np.stack([_image(f.distance[:, :crop_columns], rules) for f in validation]) if validation else None
             optimiser = torch.optim.Adam(network.parameters(), learning_rate)
-            for _ in range(steps):
-                crops = torch.from_numpy(np.stack([_crop(frames, rules, crop_columns, rng) for _ in range(batch)]))
-                made = network(crops[:, None, 0::2])[:, 0]
-                loss = (made[:, 1:-1:2] - crops[:, 1:-1:2]).abs().mean()
+            schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+            losses: list[float] = []
+            for step in range(1, steps + 1):
+                crops = np.stack([_crop(frames, rules, crop_columns, rng) for _ in range(batch)])
+                loss = _loss(network, torch.from_numpy(crops).to(device))
                 optimiser.zero_grad()
-                loss.backward()
+                loss.backward()  # type: ignore[no-untyped-call]
                 optimiser.step()
+                schedule.step()
+                losses.append(float(loss.detach()))
+                if not math.isfinite(losses[-1]):
+                    raise ValueError(f"the loss of step {step} is {losses[-1]}; lower the learning rate")
+                if step % LOG_STEPS == 0 or step == steps:
+                    progress(step, steps, float(np.mean(losses)), _held_out_loss(network, held))
+                    losses.clear()
     finally:
         torch.set_num_threads(threads)
     return network.eval()
 
 
+def _loss(network: ShanNet, images: Tensor) -> Tensor:
+    """Of images ``[N, R, C]`` whose even rows are given."""
+    made = network(images[:, None, 0::2])[:, 0]
+    judged = images[:, 1:-1:2]
+    return torch.as_tensor((made[:, 1 : 2 * judged.shape[1] : 2] - judged).abs().mean())
+
+
+def _held_out_loss(network: ShanNet, images: NDArray[np.float32] | None) -> float | None:
+    """Nothing dropped, normalised as in use; the network is left as it was."""
+    if images is None:
+        return None
+    network.eval()
+    with torch.no_grad():
+        one_by_one = torch.split(torch.from_numpy(images).to(network.output.weight.device), 1)
+        loss = float(np.mean([float(_loss(network, image)) for image in one_by_one]))
+    network.train()
+    return loss
+
+
+def _image(counts: U16, rules: Rules) -> NDArray[np.float32]:
+    """``[R, W]`` counts / 80 m."""
+    return np.where(rules.valid(counts), counts * (rules.distance_unit_m / FULL_SCALE_M), 0).astype(np.float32)
+
+
 def _crop(frames: Sequence[Frame], rules: Rules, columns: int, rng: np.random.Generator) -> NDArray[np.float32]:
     """Some neighbouring columns of a frame, ``[R, columns]`` / 80 m; over the seam too."""
     counts = frames[int(rng.integers(len(frames)))].distance
-    counts = np.roll(counts, -int(rng.integers(counts.shape[1])), axis=1)[:, :columns]
-    return np.where(rules.valid(counts), counts * (rules.distance_unit_m / FULL_SCALE_M), 0).astype(np.float32)
+    return _image(np.roll(counts, -int(rng.integers(counts.shape[1])), axis=1)[:, :columns], rules)

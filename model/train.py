@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import json
 import math
 import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from .baselines import Method
+from .evaluate import in_unit, with_limits
 from .frames import Frame
 from .losses import PixelGeometry, chamfer, pixel_errors
 from .network import WINDOW, NetworkError, WindowNetwork, from_state_dict
@@ -32,12 +34,14 @@ from .recipe import NETWORKS, NetworkRecipe, Recipe
 from .rules import Rules, extract_windows, generated_counts
 
 __all__ = [
+    "VALIDATION_WINDOWS",
     "Samples",
     "TorchWindowNetwork",
     "TrainingError",
     "TrainingResult",
     "collect_samples",
     "load_networks",
+    "networks_method",
     "pick_device",
     "save_networks",
     "torch_method",
@@ -45,8 +49,11 @@ __all__ = [
     "train_networks",
 ]
 
-Progress = Callable[[str, int, int, float], None]
-"""(network name, step, steps, mean loss since the call before)"""
+Progress = Callable[[str, int, int, float, float | None], None]
+"""(network name, step, steps, mean loss since the call before, loss on the validation frames or None)"""
+VALIDATION_WINDOWS = 65_536
+"""That many windows of all validation frames tell the loss to a hundredth, in a fraction of the time between two log
+entries."""
 _MIRROR = [2, 1, 0, 5, 4, 3]
 """The pixels of a window, left-right reversed."""
 
@@ -72,6 +79,16 @@ class TorchWindowNetwork(nn.Module):
             self.add_module(name, nn.Conv1d(*sizes, 1))
         for name, sizes in zip(self.linears, _steps((WINDOW * convolutions[-1] + 1, *hidden, 1)), strict=True):
             self.add_module(name, nn.Linear(*sizes))
+        if recipe.scale_free:
+            self._drop_level()
+
+    def _drop_level(self) -> None:
+        """Biases and the minimum's weights become 0 and stay so: frozen, and of a feature that is 0."""
+        with torch.no_grad():
+            self._linear(0).weight[:, -1] = 0
+            for name, parameter in self.named_parameters():
+                if name.endswith(".bias"):
+                    parameter.zero_().requires_grad_(False)
 
     def forward(self, windows: Tensor) -> Tensor:
         """``[...]``, before the final ``max(y, 0)``.
@@ -86,7 +103,8 @@ class TorchWindowNetwork(nn.Module):
         per_channel = first.weight[:, :-1].reshape(first.out_features, len(gain), WINDOW)
         weight = torch.cat([torch.einsum("hci,c->hi", per_channel, gain), first.weight[:, -1:]], dim=1)
         bias = first.bias + per_channel.sum(dim=2) @ offset
-        return self._outputs(nn.functional.linear(torch.cat([pixels, minimum], dim=-1), weight, bias), minimum)
+        first_layer = nn.functional.linear(torch.cat([pixels, self._level(minimum)], dim=-1), weight, bias)
+        return self._outputs(first_layer, minimum)
 
     def layer_by_layer(self, windows: Tensor) -> Tensor:
         """What ``forward`` gives, of the graph as it is drawn. Input ``[N, 6]``."""
@@ -94,12 +112,16 @@ class TorchWindowNetwork(nn.Module):
         features = pixels[:, None, :]
         for name in self.convolutions:
             features = self._modules[name](features)  # type: ignore[misc]
-        return self._outputs(self._linear(0)(torch.cat([features.flatten(1), minimum], dim=1)), minimum)
+        return self._outputs(self._linear(0)(torch.cat([features.flatten(1), self._level(minimum)], dim=1)), minimum)
 
     def _inputs(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         x = windows * self.recipe.scale
         minimum = x.min(dim=-1, keepdim=True).values
         return (x - minimum if self.recipe.inputs == "difference" else x), minimum
+
+    def _level(self, minimum: Tensor) -> Tensor:
+        """The minimum as a feature."""
+        return torch.zeros_like(minimum) if self.recipe.scale_free else minimum
 
     def _folded_convolutions(self) -> tuple[Tensor, Tensor]:
         """Each channel as ``gain * pixel + offset``."""
@@ -184,6 +206,8 @@ class TrainingResult:
     """Per network: (step, mean loss since the entry before)."""
     samples: int
     """Windows, or images, trained on."""
+    validation: dict[str, list[tuple[int, float]]]
+    """Per network: (step, loss of the validation frames then); empty without such frames."""
 
     @property
     def networks(self) -> tuple[WindowNetwork, WindowNetwork]:
@@ -249,13 +273,15 @@ def train_networks(
     device: str = "cpu",
     checkpoint: Path | None = None,
     checkpoint_every: int = 500,
+    validation: TrainingData | None = None,
 ) -> TrainingResult:
     """Distance, then intensity.
 
+    ``validation``: of the kind of ``data``; the loss there is logged and changes nothing of the weights.
     ``checkpoint``: a file written every so many steps, whole or not at all; where it exists the run goes on from it.
     Raises TrainingError where it belongs to another recipe or other data, or where a network dies.
     """
-    if isinstance(data, Samples) == (recipe.training.batch_images > 0):
+    if any(isinstance(d, Samples) == (recipe.training.batch_images > 0) for d in (data, validation) if d is not None):
         raise TrainingError("batches of windows need Samples, batches of images need frames")
     if not len(data):
         raise TrainingError("no frames to train on")
@@ -263,7 +289,7 @@ def train_networks(
     with _repeatable(where):
         fresh = checkpoint is None or not checkpoint.exists()
         runs = {
-            name: _best_start(recipe, name, _batches(recipe, name, data, rules, where), where, fresh)
+            name: _best_start(recipe, name, *_both(recipe, name, data, validation, rules, where), where, fresh)
             for name in NETWORKS
         }
         saved = None if checkpoint is None else _CheckpointFile(checkpoint, _identity(recipe, data), runs)
@@ -278,6 +304,7 @@ def train_networks(
         {name: run.network.cpu() for name, run in runs.items()},
         {name: run.log for name, run in runs.items()},
         len(data),
+        {name: run.held_log for name, run in runs.items() if validation},
     )
 
 
@@ -303,11 +330,21 @@ class _Batches(Protocol):
     def losses(self, step: int, network: TorchWindowNetwork) -> Iterator[tuple[Tensor, float]]:
         """Loss and share in the step of each part of the batch, to be differentiated one by one."""
 
+    def whole(self, network: TorchWindowNetwork) -> Iterator[tuple[Tensor, float]]:
+        """The same of all there is, as it is: neither mirrored nor regraded."""
+
 
 def _batches(recipe: Recipe, name: str, data: TrainingData, rules: Rules, device: torch.device) -> _Batches:
     if isinstance(data, Samples):
         return _WindowBatches(recipe, name, data, rules, device)
     return _ImageBatches(recipe, name, data, rules, device)
+
+
+def _both(
+    recipe: Recipe, name: str, data: TrainingData, validation: TrainingData | None, rules: Rules, device: torch.device
+) -> tuple[_Batches, _Batches | None]:
+    held = _batches(recipe, name, validation, rules, device) if validation else None
+    return _batches(recipe, name, data, rules, device), held
 
 
 class _WindowBatches:
@@ -323,14 +360,23 @@ class _WindowBatches:
 
     def losses(self, step: int, network: TorchWindowNetwork) -> Iterator[tuple[Tensor, float]]:
         rng = np.random.default_rng([*self.seed, step])
-        index = rng.integers(0, len(self.windows), self.settings.batch)
-        x, y = (torch.from_numpy(v[index].astype(np.float32) * self.unit) for v in (self.windows, self.targets))
+        x, y = self._chosen(rng.integers(0, len(self.windows), self.settings.batch))
         if self.name == "intensity":
             x, y = self._regraded(x, y, rng)
         if self.settings.mirror and step % 2 == 0:
             x = x[:, _MIRROR]
-        error = _seen(network, x.to(self.device)) - y.to(self.device)
-        yield pixel_errors(error, self.loss).mean(), 1.0
+        yield self._loss(network, x, y), 1.0
+
+    def whole(self, network: TorchWindowNetwork) -> Iterator[tuple[Tensor, float]]:
+        for part in np.split(np.arange(len(self.windows)), range(8192, len(self.windows), 8192)):
+            yield self._loss(network, *self._chosen(part)), len(part) / len(self.windows)
+
+    def _chosen(self, index: NDArray[np.integer[Any]]) -> tuple[Tensor, Tensor]:
+        x, y = (torch.from_numpy(v[index].astype(np.float32) * self.unit) for v in (self.windows, self.targets))
+        return x, y
+
+    def _loss(self, network: TorchWindowNetwork, x: Tensor, y: Tensor) -> Tensor:
+        return pixel_errors(_seen(network, x.to(self.device)) - y.to(self.device), self.loss).mean()
 
     def _regraded(self, x: Tensor, y: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         """Intensities as other lasers would have graded them."""
@@ -358,6 +404,10 @@ class _ImageBatches:
         for index in chosen:
             loss = self._image_loss(self.frames[index], network, mirror=self.settings.mirror and step % 2 == 0)
             yield loss, 1.0 / len(chosen)
+
+    def whole(self, network: TorchWindowNetwork) -> Iterator[tuple[Tensor, float]]:
+        for frame in self.frames:
+            yield self._image_loss(frame, network, mirror=False), 1.0 / len(self.frames)
 
     def _image_loss(self, frame: Frame, network: TorchWindowNetwork, mirror: bool) -> Tensor:
         windows = extract_windows(frame.distance[frame.given], frame.intensity[frame.given], self.rules)
@@ -402,18 +452,20 @@ def _seen(network: TorchWindowNetwork, windows: Tensor) -> Tensor:
     if not network.recipe.relu_in_loss:
         return y
     y = torch.relu(y)
-    if not bool((y > 0).any()):
+    if torch.is_grad_enabled() and not bool((y > 0).any()):
         raise TrainingError("the network is dead: every output is 0, so nothing has a gradient; change the seed")
     return y
 
 
-def _best_start(recipe: Recipe, name: str, batches: _Batches, device: torch.device, fresh: bool) -> _Run:
+def _best_start(
+    recipe: Recipe, name: str, batches: _Batches, held: _Batches | None, device: torch.device, fresh: bool
+) -> _Run:
     """Saturating losses have poor minima that a run does not leave: look at several starts before choosing one.
 
     A run that a checkpoint will fill needs no choice."""
     if recipe.training.starts == 1 or not fresh:
-        return _Run(recipe, name, batches, device)
-    runs = [_Run(recipe, name, batches, device, start) for start in range(recipe.training.starts)]
+        return _Run(recipe, name, batches, device, held=held)
+    runs = [_Run(recipe, name, batches, device, start, held) for start in range(recipe.training.starts)]
     for run in runs:
         for _ in range(max(1, run.steps // 8)):
             run.advance(lambda *_: None)
@@ -424,13 +476,25 @@ def _recent_loss(run: _Run) -> float:
     return float(np.mean([loss for _, loss in run.log[-4:]] or [_mean(run.since_log)]))
 
 
+_PLAIN_STATE = ("step", "log", "held_log", "since_log", "since_epoch")
+
+
 class _Run:
     """The training of one network: all that a checkpoint must hold."""
 
-    def __init__(self, recipe: Recipe, name: str, batches: _Batches, device: torch.device, start: int = 0) -> None:
+    def __init__(
+        self,
+        recipe: Recipe,
+        name: str,
+        batches: _Batches,
+        device: torch.device,
+        start: int = 0,
+        held: _Batches | None = None,
+    ) -> None:
         settings = recipe.training
         torch.manual_seed(recipe.seed + start)
-        self.name, self.batches = name, batches
+        self.name, self.batches, self.held = name, batches, held
+        self.validate_every = settings.validate_every
         self.network = TorchWindowNetwork(recipe.networks[name]).to(device)
         self.steps = _run_steps(recipe, name, batches.per_epoch)
         self.optimiser = torch.optim.Adam(
@@ -440,6 +504,7 @@ class _Run:
         self.every_epoch = settings.schedule == "plateau"
         self.step = 0
         self.log: list[tuple[int, float]] = []
+        self.held_log: list[tuple[int, float]] = []
         self.since_log = [0.0, 0.0]
         """Sum and number of the losses since the log's last entry; since the epoch began."""
         self.since_epoch = [0.0, 0.0]
@@ -467,15 +532,24 @@ class _Run:
         if self.step % min(50, self.batches.per_epoch) == 0 or self.step == self.steps:
             self.log.append((self.step, _mean(self.since_log)))
             self.since_log = [0.0, 0.0]
-            progress(self.name, self.step, self.steps, self.log[-1][1])
+            progress(self.name, self.step, self.steps, self.log[-1][1], self._validate())
+
+    def _validate(self) -> float | None:
+        """The loss on the validation frames, where it is due; no random number is drawn."""
+        if self.held is None or (len(self.log) % self.validate_every and self.step < self.steps):
+            return None
+        with torch.no_grad():
+            loss = sum(float(part) * share for part, share in self.held.whole(self.network))
+        self.held_log.append((self.step, loss))
+        return loss
 
     def state(self) -> dict[str, Any]:
-        plain = {key: getattr(self, key) for key in ("step", "log", "since_log", "since_epoch")}
+        plain = {key: getattr(self, key) for key in _PLAIN_STATE}
         parts = {key: getattr(self, key).state_dict() for key in ("network", "optimiser", "schedule")}
         return {**plain, **parts}
 
     def load(self, state: Mapping[str, Any]) -> None:
-        for key in ("step", "log", "since_log", "since_epoch"):
+        for key in _PLAIN_STATE:
             setattr(self, key, state[key])
         for key in ("network", "optimiser", "schedule"):
             getattr(self, key).load_state_dict(state[key])
@@ -553,18 +627,49 @@ def torch_method(modules: Mapping[str, TorchWindowNetwork]) -> Method:
     return run
 
 
-def save_networks(path: Path, modules: Mapping[str, TorchWindowNetwork]) -> None:
-    """Weights and graph of both networks as a ``.pt`` file: of networks that a model file cannot hold."""
-    torch.save({name: {"graph": asdict(m.recipe), "state": m.state_dict()} for name, m in modules.items()}, path)
+def save_networks(
+    path: Path,
+    modules: Mapping[str, TorchWindowNetwork],
+    rules: Rules | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Weights, graph and rules of both networks as a ``.pt`` file: of networks that a model file cannot hold."""
+    saved: dict[str, Any] = {name: {"graph": asdict(m.recipe), "state": m.state_dict()} for name, m in modules.items()}
+    if rules is not None:
+        plain = {f.name: getattr(rules, f.name) for f in fields(rules)}
+        saved["rules"] = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in plain.items()}
+    torch.save({**saved, "provenance": json.dumps(dict(provenance or {}))}, path)
 
 
-def load_networks(path: Path) -> dict[str, TorchWindowNetwork]:
-    """What ``save_networks`` wrote (only tensors and plain values are unpickled). Raises NetworkError."""
+def load_networks(path: str | Path) -> dict[str, TorchWindowNetwork]:
+    """The networks that ``save_networks`` wrote (only tensors and plain values are unpickled). Raises NetworkError."""
+    return _load_networks(path)[0]
+
+
+def _load_networks(path: str | Path) -> tuple[dict[str, TorchWindowNetwork], Rules | None]:
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
         modules = {name: TorchWindowNetwork(NetworkRecipe(**saved[name]["graph"])) for name in NETWORKS}
         for name, module in modules.items():
             module.load_state_dict(saved[name]["state"])
+        return modules, Rules(**saved["rules"]) if "rules" in saved else None
     except Exception as error:
         raise NetworkError(f"{path}: cannot be read as networks: {' '.join(str(error).split())[:200]}") from None
-    return modules
+
+
+def networks_method(path: str | Path) -> Method:
+    """What ``save_networks`` wrote, rules included, behind the interface of the baselines, under the caller's range
+    limits. Raises NetworkError."""
+    modules, own = _load_networks(path)
+    if own is None:
+        raise NetworkError(f"{path}: holds networks without the rules they were trained under")
+    rules = own
+    method = torch_method(modules)
+
+    def run(
+        distance: NDArray[np.uint16], intensity: NDArray[np.uint8], limits: Rules
+    ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+        limited = with_limits(in_unit(rules, limits.distance_unit_m), limits.min_count, limits.max_count)
+        return method(distance, intensity, limited)
+
+    return run

@@ -290,11 +290,37 @@ def test_wrong_usage_is_one_line(tmp_path):
         (["sim", "--protocol", "tulip", "--full"], "its own rows"),
         (["sim", "--model", model], "another method is called valid-mean"),
         ([tmp_path / "absent.pcap"], "absent.pcap"),
+        (["sim", "--with", model], "another method is called valid-mean"),
+        (["sim", "--with", tmp_path / "absent.ubm"], "absent.ubm"),
+        (["sim", "--with", tmp_path / "absent.pt"], "absent.pt"),
+        (["sim", "--drive", "a"], "--drive is of a folder"),
+        ([tmp_path, "--drive", "a"], "no .bin frames"),
+        (["sim", "--protocol", "tulip", "--drive", "a"], "no --drive"),
     ):
         result = run("evaluate", *arguments)
         assert result.exit_code != 0
         assert said in str(result.exception), (arguments, result.exception)
         assert "\n" not in str(result.exception)
+
+
+def test_a_model_beside_the_shipped_one(tmp_path):
+    model = tmp_path / "other.ubm"
+    model.write_bytes(load_model("hdl-64e-8").data)
+    data = json.loads(run("evaluate", "sim", "--frames", 1, "--columns", 256, "--with", model, "--json").stdout)
+    assert {"upbeam-fp32", "other"} <= set(data["methods"])
+    assert {name: m["multiply_adds_per_window"] for name, m in data["models"].items()} == {
+        "upbeam-fp32": 96,
+        "other": 64,
+    }
+    assert "monte_carlo_passes" not in data
+
+
+def test_frames_of_one_drive(data_dir):
+    """Ten of the 26 frames come from drive-a."""
+    arguments = ["evaluate", data_dir / "kitti" / "frames", "--drive", "drive-a", "--columns", 256, "--json"]
+    data = json.loads(run(*arguments).stdout)
+    assert (data["frames"], data["drives"]) == (10, ["drive-a"])
+    assert "drive-z" in str(run(*arguments, "--drive", "drive-z").exception)
 
 
 def test_real_frames(data_dir):

@@ -14,12 +14,22 @@ from upbeam.cli.common import UserError
 from upbeam.cli.sources import recipe_frames, simulated_scans, source_frames
 from upbeam.model.beams import beam_table
 from upbeam.model.geometry import to_points
-from upbeam.model.recipe import DataRecipe, RecipeError, load_recipe, recipe_names
+from upbeam.model.recipe import (
+    DataRecipe,
+    Recipe,
+    RecipeError,
+    UNetRecipe,
+    load_any_recipe,
+    load_recipe,
+    recipe_names,
+    with_length,
+    with_simulated_data,
+)
 
 
 @pytest.mark.parametrize("name", recipe_names())
 def test_shipped_recipes_load(name):
-    recipe = load_recipe(name)
+    recipe = load_any_recipe(name)
     assert recipe.name == name
     assert recipe.make_rules().columns == recipe.columns
 
@@ -65,6 +75,13 @@ def raw():
         (lambda r: r["data"][0].update(projection="fish-eye"), "projection"),
         (lambda r: r.update(rows="elevation"), "projection: recorded"),
         (lambda r: r.update(validation=[]), "validation"),
+        (lambda r: r["training"].update(validate_every=0), "training.validate_every is 0"),
+        (lambda r: r.update(data=[{"source": "capture"}]), r"data\[0\].path names no capture"),
+        (lambda r: r.update(data=[{"source": "capture", "path": "a", "hide": "none"}]), "every-other or three-of-four"),
+        (lambda r: r.update(data=[{"source": "capture", "path": "a", "may_ship": True}]), "licence"),
+        (lambda r: r.update(rows="elevation", data=[{"source": "capture", "path": "a"}]), "KITTI's binning"),
+        (lambda r: r["data"][0].update(path="a.pcap"), r"data\[0\].path is of source: capture"),
+        (lambda r: r.update(unet={"width": 0, "steps": 5}), "unknown key"),
     ],
 )
 def test_wrong_recipes_are_refused(tmp_path, change, named):
@@ -101,6 +118,51 @@ def test_the_paper_recipe_is_the_papers():
     for network in recipe.networks.values():
         assert network.widths == ((8, 2), (12,))
         assert (network.slope, network.inputs, network.output, network.scale) == (0.01, "raw", "raw", 1.0)
+
+
+def test_recipes_of_a_u_net(tmp_path):
+    recipe = load_any_recipe("shan-small")
+    assert isinstance(recipe, UNetRecipe)
+    assert {s.only_drives for s in recipe.validation} == {s.without_drives for s in recipe.data} == {("drive-a",)}
+    with pytest.raises(RecipeError, match="trains a U-Net"):
+        load_recipe("shan-small")
+    text = resources.files("upbeam.model").joinpath("recipes/shan-small.yaml").read_text()
+    for change, named in (("width: 0.125", "width: 9"), ("steps: 5000", "steps: 0")):
+        (tmp_path / "u.yaml").write_text(text.replace(change, named))
+        with pytest.raises(RecipeError, match=f"unet.{named.partition(':')[0]} is"):
+            load_any_recipe(tmp_path / "u.yaml")
+
+
+def test_the_paper_s_network_on_rings_is_the_same_recipe():
+    ring, small = load_recipe("paper-ring"), load_recipe("paper-small")
+    assert replace(ring, name=small.name, rows="elevation") == small
+    assert ring.make_rules().sensor == "hdl-64e/2"
+
+
+def test_other_lengths():
+    """Epochs in proportion; what a recipe does not count in is refused."""
+    paper = with_length(load_recipe("paper-small"), epochs=10)
+    assert isinstance(paper, Recipe)
+    assert paper.training.epochs == {"distance": 10, "intensity": 2}
+    steps = with_length(load_recipe("default"), steps=7)
+    assert isinstance(steps, Recipe)
+    assert steps.training.steps == 7
+    unet = with_length(load_any_recipe("shan-small"), steps=3)
+    assert isinstance(unet, UNetRecipe)
+    assert unet.unet.steps == 3
+    assert with_length(load_recipe("default")) == load_recipe("default")
+    for name, length in (("default", {"epochs": 3}), ("paper-small", {"steps": 3}), ("shan-small", {"epochs": 3})):
+        with pytest.raises(RecipeError, match=f"recipe {name} counts"):
+            with_length(load_any_recipe(name), **length)
+
+
+@pytest.mark.parametrize("name", ["paper-small", "shan-small"])
+def test_any_recipe_on_simulated_frames(name):
+    recipe = with_simulated_data(load_any_recipe(name), 4)
+    assert [s.frames for s in (*recipe.data, *recipe.validation)] == [4, 2]
+    assert recipe.data[0].seed != recipe.validation[0].seed
+    (frame,) = recipe_frames(recipe, recipe.make_rules(), (replace(recipe.data[0], frames=1),))
+    assert frame.distance.shape == (64, 2048)
 
 
 def test_elevation_rows_have_their_own_beams():

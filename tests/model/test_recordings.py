@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import sqlite3
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import dpkt
@@ -13,11 +14,15 @@ import pytest
 import velodyne_decoder
 import yaml
 
+from upbeam.cli.common import UserError
+from upbeam.cli.sources import describe_source, may_ship, recipe_frames, source_frames
 from upbeam.model import recordings
 from upbeam.model.beams import beam_table
 from upbeam.model.geometry import azimuth_deg, column_of, to_points
 from upbeam.model.io import CloudError
-from upbeam.model.recordings import capture_frames, open_capture
+from upbeam.model.recipe import DataRecipe, load_recipe
+from upbeam.model.recordings import capture_frames, open_capture, training_frames
+from upbeam.model.rules import Rules
 
 CAPTURES = {
     "hdl-32e": "velodyne_hdl32e/sample_velodyne_hdl32.pcap",
@@ -376,3 +381,60 @@ def test_missing_extra_is_named(tmp_path, monkeypatch):
     ):
         open_capture(path)
     assert beam_table("vls-128").beams == 128
+
+
+# ------------------------------------------------------------------------------------------------------- to train on
+
+
+def small_recipe(**changes):
+    return replace(load_recipe("smoke"), columns=180, rules={"ground_reach": 0.0}, **changes)
+
+
+def test_a_capture_as_training_data(tmp_path, monkeypatch):
+    """Every other beam of 32 hidden: 16 rows given, 15 between them; 4 mm of a VLP-32C become the recipe's 2 mm."""
+    path = pcap(tmp_path, turning(0x28, 4.5))
+    recipe = small_recipe(data=(DataRecipe("capture", path=str(path), columns=100, licence="mine"),))
+    (source,) = recipe.data
+    frames = list(recipe_frames(recipe, recipe.make_rules()))
+    own = list(capture_frames(path, columns=100))
+    assert len(frames) == source_frames(source) == len(own) == 4
+    for frame, seen in zip(frames, own, strict=True):
+        assert frame.distance_unit_m == 0.002
+        assert np.array_equal(frame.distance, 2 * seen.distance)
+        assert len(frame.distance[frame.given]) == 16
+        assert len(frame.distance[frame.truth]) == 15
+    assert len(list(recipe_frames(recipe, recipe.make_rules(), (replace(source, frames=1, columns=0),)))) == 1
+    assert describe_source(source) == (
+        "capture made.pcap of a vlp-32c, 4 turns, every-other beams hidden (licence mine; may not ship)"
+    )
+    assert not may_ship(source)
+    assert may_ship(replace(source, may_ship=True))
+    monkeypatch.setenv("UPBEAM_DATA", str(tmp_path))
+    assert source_frames(replace(source, path="made.pcap")) == 4
+
+
+def test_captures_that_cannot_be_trained_on(tmp_path):
+    recipe = small_recipe()
+    rules = recipe.make_rules()
+    for path, error, said in (
+        (str(tmp_path / "absent.pcap"), UserError, "absent.pcap"),
+        ("old.bag", UserError, "rosbags-convert"),
+        (str(pcap(tmp_path, turning(0x28, 1.2))), CloudError, "no whole turn"),
+    ):
+        with pytest.raises(error, match=said):
+            list(recipe_frames(recipe, rules, (DataRecipe("capture", path=path),)))
+
+
+def test_three_of_four_beams_hidden(data_dir):
+    """A VLS-128 as a sensor of 64 beams. Its 32 given beams are not an HDL-64E's, whose row limits do not fit them."""
+    path = data_dir / "packets" / CAPTURES["vls-128"]
+    capture = open_capture(path)
+    rules = Rules.for_beams(beam_table("hdl-64e"), ground_reach=0.0)
+    whole = next(training_frames(capture, rules, columns=512))
+    frame = next(training_frames(capture, rules, columns=512, hide="three-of-four"))
+    assert (whole.rows, frame.rows) == (128, 64)
+    assert np.array_equal(frame.distance, whole.distance[::2])
+    assert frame.elevation_deg == pytest.approx(capture.beams.elevation_deg[::2], abs=4e-3)
+    with pytest.raises(CloudError, match="not those of hdl-64e/2"):
+        next(training_frames(capture, Rules.for_beams(beam_table("hdl-64e")), hide="three-of-four"))
+    next(training_frames(capture, Rules.for_beams(beam_table("hdl-64e")), columns=512))  # 64 given rows: no limits

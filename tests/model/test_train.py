@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import importlib.util
 import json
 from dataclasses import asdict, replace
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,7 @@ from upbeam.model.evaluate import evaluate
 from upbeam.model.frames import Frame, kitti_frames
 from upbeam.model.metrics import chamfer_m2
 from upbeam.model.network import NetworkError, load_state_dict
-from upbeam.model.recipe import Loss, NetworkRecipe, load_recipe
+from upbeam.model.recipe import Loss, NetworkRecipe, load_any_recipe, load_recipe
 from upbeam.model.rules import Rules, extract_windows, upsample_reference
 from upbeam.runtime._native import raw_windows
 
@@ -395,7 +397,8 @@ def test_an_interrupted_run_ends_with_the_same_bits(smoke, images, tmp_path, kin
 
     recipe = small_run(smoke[0], kind)
     rules, data = (smoke[1], smoke[2]) if kind == "windows" else images
-    whole = train_networks(recipe, data, rules)
+    held = samples_part(data) if kind == "windows" else data[:1]
+    whole = train_networks(recipe, data, rules, validation=held)
     path, every = tmp_path / "run.ckpt", 7 if kind == "windows" else 3
 
     class StopError(Exception):
@@ -403,17 +406,16 @@ def test_an_interrupted_run_ends_with_the_same_bits(smoke, images, tmp_path, kin
 
     for stop_in in ("distance", "intensity"):  # interrupted twice, once in each network
 
-        def progress(name, step, steps, loss, stop_in=stop_in):
+        def progress(name, step, steps, loss, validation, stop_in=stop_in):
             if name == stop_in and step >= steps // 2:
                 raise StopError
 
         with pytest.raises(StopError):
-            train_networks(
-                recipe, data, rules, progress, checkpoint=path, checkpoint_every=7 if kind == "windows" else 3
-            )
+            train_networks(recipe, data, rules, progress, checkpoint=path, checkpoint_every=every, validation=held)
         assert path.exists()
-    resumed = train_networks(recipe, data, rules, checkpoint=path, checkpoint_every=every)
+    resumed = train_networks(recipe, data, rules, checkpoint=path, checkpoint_every=every, validation=held)
     assert resumed.losses == whole.losses
+    assert resumed.validation == whole.validation
     for name, module in whole.modules.items():
         for key, value in module.state_dict().items():
             assert resumed.modules[name].state_dict()[key].numpy().tobytes() == value.numpy().tobytes()
@@ -424,6 +426,53 @@ def test_an_interrupted_run_ends_with_the_same_bits(smoke, images, tmp_path, kin
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(TrainingError, match="no checkpoint"):
         train_networks(recipe, data, rules, checkpoint=path)
+
+
+def samples_part(samples):
+    """Every seventh window, as if of other frames."""
+    return type(samples)(*(getattr(samples, field)[::7] for field in asdict(samples)))
+
+
+@pytest.mark.parametrize("kind", ["windows", "images"])
+def test_a_validation_loss_changes_no_bit(torch, smoke, images, kind):
+    """Same weights and losses with and without; the loss is the one of the finished network, as it is."""
+    from upbeam.model import train
+
+    recipe = small_run(smoke[0], kind)
+    recipe = replace(recipe, training=replace(recipe.training, validate_every=2))
+    rules, data = (smoke[1], smoke[2]) if kind == "windows" else images
+    held = samples_part(data) if kind == "windows" else data[:1]
+    calls = []
+    plain = train.train_networks(recipe, data, rules)
+    result = train.train_networks(recipe, data, rules, lambda *call: calls.append(call), validation=held)
+    assert plain.validation == {}
+    assert result.losses == plain.losses
+    for name, module in plain.modules.items():
+        for key, value in module.state_dict().items():
+            assert result.modules[name].state_dict()[key].numpy().tobytes() == value.numpy().tobytes()
+        logged = [step for step, _ in result.losses[name]]
+        due = logged[1::2] if len(logged) % 2 == 0 else [*logged[1::2], logged[-1]]
+        assert [step for step, _ in result.validation[name]] == due
+        told = [(step, loss) for n, step, _, _, loss in calls if n == name and loss is not None]
+        assert told == result.validation[name][-len(told) :]
+        batches = train._batches(recipe, name, held, rules, train.pick_device("cpu"))
+        with torch.no_grad():
+            by_hand = sum(float(part) * share for part, share in batches.whole(result.modules[name]))
+        assert result.validation[name][-1][1] == pytest.approx(by_hand)
+
+
+def test_the_validation_loss_of_windows_by_hand(torch, smoke, trained):
+    """Of a mean over chunks of unequal length, too."""
+    from upbeam.model import train
+
+    recipe, rules, samples = smoke
+    batches = train._batches(recipe, "intensity", samples, rules, train.pick_device("cpu"))
+    module = trained.modules["intensity"]
+    with torch.no_grad():
+        y = module(torch.from_numpy(samples.intensity.astype(np.float32))).numpy()
+        whole = sum(float(part) * share for part, share in batches.whole(module))
+    assert len(samples) % 8192
+    assert whole == pytest.approx(np.abs(y - samples.intensity_target).mean(), rel=1e-5)
 
 
 def test_of_several_starts_the_best_goes_on(smoke):
@@ -438,7 +487,7 @@ def test_of_several_starts_the_best_goes_on(smoke):
         for _ in range(50):
             run.advance(lambda *_: None)
     losses = [run.log[-1][1] for run in runs]
-    chosen = train._best_start(short, "distance", batches, train.pick_device("cpu"), fresh=True)
+    chosen = train._best_start(short, "distance", batches, None, train.pick_device("cpu"), fresh=True)
     assert len(set(losses)) == 4
     assert chosen.log == runs[int(np.argmin(losses))].log
     assert chosen.step == 50
@@ -516,6 +565,12 @@ def test_wrong_data_or_device_is_refused(torch, smoke, images):
 # ----------------------------------------------------------------------------------------------------- command line
 
 
+UNCHANGED = {
+    "evaluate": None, "checkpoint": None, "checkpoint_every": 10, "device": "cpu",
+    "epochs": None, "steps": None, "simulated": None,
+}  # fmt: skip
+
+
 def tiny_recipe(path, widths):
     recipe = asdict(replace(load_recipe("smoke"), windows=2000))
     del recipe["validation"]
@@ -534,13 +589,17 @@ def test_the_command_writes_model_log_and_picture(torch, tmp_path, capsys):
 
     recipe = tiny_recipe(tmp_path / "tiny.yaml", [8, 2, 12])
     out = tmp_path / "tiny.ubm"
-    arguments = {"evaluate": None, "checkpoint": tmp_path / "tiny.ckpt", "checkpoint_every": 10, "device": "cpu"}
+    arguments = {**UNCHANGED, "checkpoint": tmp_path / "tiny.ckpt"}
     train(recipe, out, as_json=True, **arguments)
     summary = json.loads(capsys.readouterr().out)
     assert upbeam.load_model(out).crc32 == int(summary["crc32"], 16)
     assert summary["samples"] == 2000
     assert set(summary["validation"]["methods"]) == {*BASELINES, "smoke"}
-    assert out.with_suffix(".csv").read_text().startswith("network,step,loss\n")
+    with out.with_suffix(".csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["network", "step", "loss", "validation_loss"]
+    assert {row["network"] for row in rows} == {"distance", "intensity"}
+    assert all(float(row["loss"]) > 0 and float(row["validation_loss"]) > 0 for row in rows)
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "tiny.ckpt").exists()
 
@@ -551,12 +610,28 @@ def test_the_command_keeps_what_a_model_file_cannot_hold(torch, tmp_path, capsys
     from upbeam.model.train import load_networks
 
     recipe = tiny_recipe(tmp_path / "tiny.yaml", [[8, 2], [12, 6]])
-    arguments = {"evaluate": None, "checkpoint": None, "checkpoint_every": 10, "device": "cpu", "as_json": True}
+    arguments = {**UNCHANGED, "as_json": True}
     with pytest.raises(UserError, match=r"must end in \.pt"):
         train(recipe, tmp_path / "tiny.ubm", **arguments)
     train(recipe, tmp_path / "tiny.pt", **arguments)
     assert json.loads(capsys.readouterr().out)["validation"]["methods"]["smoke"]["mae_m"] > 0
     assert load_networks(tmp_path / "tiny.pt")["distance"].recipe.widths == ((8, 2), (12, 6))
+
+
+def test_what_the_command_line_changes_is_told(torch, tmp_path, capsys):
+    """Epochs and data of the recipe replaced: by what, stands in the model."""
+    from upbeam.cli.train import train
+
+    text = resources.files("upbeam.model").joinpath("recipes/paper-ring.yaml").read_text()
+    (tmp_path / "narrow.yaml").write_text(text.replace("columns: 2048", "columns: 128"))
+    changed = {**UNCHANGED, "epochs": 4, "simulated": 2}
+    train(str(tmp_path / "narrow.yaml"), tmp_path / "narrow.ubm", **changed, as_json=True)
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["changes"] == {"epochs": 4, "simulated": 2}
+    provenance = upbeam.load_model(tmp_path / "narrow.ubm").file.provenance
+    assert provenance["changes"] == summary["changes"]
+    assert provenance["data"] == ["upbeam simulator, 2 frames, seed 5000"]
+    assert summary["validation"]["frames"] == 1
 
 
 # ------------------------------------------------------------------------------------------------------- Shan 2020
@@ -629,3 +704,77 @@ def test_shan_network_of_the_paper(torch):
     dropped = network.passes(torch.rand(32, 32), 3, seed=0)
     assert dropped.shape == (3, 64, 32)
     assert not torch.equal(dropped[0], dropped[1])
+
+
+def test_shan_is_as_published_where_it_can_be(torch):
+    """50 passes, removed above 0.03 of the mean."""
+    import inspect
+
+    from upbeam.cli import evaluate
+    from upbeam.model import shan
+
+    assert shan.PASSES == evaluate.PASSES == inspect.signature(shan.shan_method).parameters["passes"].default == 50
+    assert shan.UNCERTAIN == inspect.signature(shan.uncertain_removed).parameters["share"].default == 0.03
+
+
+def test_shan_s_validation_changes_no_bit(torch, images):
+    from upbeam.model.shan import train_shan
+
+    rules, frames = images
+    short = {"width": 1 / 64, "steps": 30, "crop_columns": 32, "batch": 1, "seed": 8}
+    calls = []
+    a = train_shan(frames, rules, **short).state_dict()
+    b = train_shan(frames, rules, **short, validation=frames[:2], progress=lambda *c: calls.append(c)).state_dict()
+    assert all(torch.equal(a[key], b[key]) for key in a)
+    assert [call[:2] for call in calls] == [(25, 30), (30, 30)]
+    assert all(0 < call[2] < 1 and 0 < call[3] < 1 for call in calls)
+
+
+def test_networks_and_u_net_beside_the_baselines(torch, tmp_path, capsys):
+    """From the commands alone: train both kinds of .pt, and judge them in one table."""
+    from typer.testing import CliRunner
+
+    from upbeam.cli.main import app
+    from upbeam.cli.train import train
+
+    two = tmp_path / "two-layers.pt"
+    train(tiny_recipe(tmp_path / "tiny.yaml", [[8, 2], [12, 6]]), two, **UNCHANGED)
+    recipe = asdict(load_any_recipe("shan-small"))
+    recipe.update(columns=256, unet={"width": 1 / 64, "steps": 60, "batch": 2, "crop_columns": 128})
+    recipe["data"] = [{"source": "simulator", "frames": 2, "seed": 3}]
+    del recipe["validation"]
+    (tmp_path / "u.yaml").write_text(json.dumps(recipe))
+    unet = tmp_path / "unet.pt"
+    train(str(tmp_path / "u.yaml"), unet, **UNCHANGED, as_json=True)
+    capsys.readouterr()
+    arguments = ["evaluate", "sim", "--frames", "1", "--columns", "256", "--passes", "3", "--json"]
+    done = CliRunner().invoke(app, [*arguments, "--with", str(two), "--with", str(unet)])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert {*BASELINES, "upbeam-fp32", "two-layers", "unet"} == set(found["methods"])
+    assert found["monte_carlo_passes"] == {"unet": 3}
+    assert found["models"]["upbeam-fp32"]["multiply_adds_per_window"] == 96
+    (tmp_path / "other.pt").write_bytes(b"no")
+    for path, said in ((tmp_path / "other.pt", "a file of upbeam train"), (tmp_path / "absent.pt", "no such file")):
+        wrong = CliRunner().invoke(app, [*arguments, "--with", str(path)])
+        assert said in str(wrong.exception)
+
+
+def test_saved_networks_keep_their_rules(torch, tmp_path):
+    """The paper's rules in the file, the caller's range limits: as the reference under both."""
+    from upbeam.model.train import TorchWindowNetwork, networks_method, save_networks, torch_method
+
+    torch.manual_seed(1)
+    modules = {name: TorchWindowNetwork(network_recipe((8, 2), (12, 6))) for name in ("distance", "intensity")}
+    own = Rules.for_beams(beam_table("hdl-64e"), columns=40, edge="zero", empty="none", ground_reach=0.0)
+    save_networks(tmp_path / "n.pt", modules, own)
+    caller = replace(own, edge="seam", empty="fill", max_count=30_000, row_max_count=np.full(64, 30_000))
+    distance, intensity = random_image(np.random.default_rng(1), 32, 40)
+    found = networks_method(tmp_path / "n.pt")(distance, intensity, caller)
+    limited = replace(own, max_count=30_000, row_max_count=np.full(64, 30_000))
+    expected, other = (torch_method(modules)(distance, intensity, rules) for rules in (limited, caller))
+    assert np.array_equal(found[0], expected[0])
+    assert not np.array_equal(found[0], other[0])
+    save_networks(tmp_path / "bare.pt", modules)
+    with pytest.raises(NetworkError, match="without the rules"):
+        networks_method(tmp_path / "bare.pt")

@@ -20,12 +20,13 @@ from upbeam.model.evaluate import BASE, Evaluation, Interval, in_unit, paired_ra
 from upbeam.model.evaluate import evaluate as run_evaluation
 from upbeam.model.frames import Frame, RowRule, kitti_files, kitti_frames
 from upbeam.model.metrics import BANDS_M
+from upbeam.model.network import NetworkError
 from upbeam.model.rules import BEAMS, Rules, upsample_reference
 from upbeam.model.tulip import TulipMetrics, evaluate_tulip, tulip_frames, tulip_rules
 from upbeam.runtime.upsampler import Model, Upsampler, load_model
 
 from .common import JsonOption, UserError, emit_json, message, progress_bar, show, table
-from .sources import frame_of_scan, simulated_scans
+from .sources import frame_of_scan, kitti_files_of_drives, simulated_scans
 
 __all__ = [
     "Table",
@@ -44,6 +45,8 @@ FloatArray = NDArray[np.float64]
 
 SHIPPED = "upbeam-fp32"
 CAPTURES = (".pcap", ".db3")
+PASSES = 50
+"""Of Shan's U-Net, as published (``shan.PASSES``; here so that no command needs PyTorch to start)."""
 NAME_WIDTH = 13
 ACCURACY = ("Chamfer", "MAE", "both", "ghosts", "cover")
 SURFACES = {int(s): s.name.lower() for s in Surface}
@@ -87,7 +90,18 @@ def evaluate(
         list[str] | None,
         typer.Option(help="A .ubm model instead of the shipped one; may be given several times."),
     ] = None,
+    beside: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with",
+            help="Another method beside all others: a .ubm model, or a .pt file of upbeam train; several times.",
+        ),
+    ] = None,
+    passes: Annotated[int, typer.Option(min=2, help="Monte-Carlo passes of Shan's U-Net.")] = PASSES,
     frames: Annotated[int | None, typer.Option(min=1, help="At most so many frames (sim: 20).")] = None,
+    drive: Annotated[
+        list[str] | None, typer.Option(help="Only frames of this drive of the folder's drives.tsv; several times.")
+    ] = None,
     rows: Annotated[str, typer.Option(help="ring or elevation (the paper's binning).")] = "ring",
     columns: Annotated[
         int | None, typer.Option(min=4, max=65535, help="Width of the images, where not the model's.")
@@ -105,16 +119,19 @@ def evaluate(
     if protocol not in ("upbeam", "tulip"):
         raise UserError(f"--protocol {protocol}: expected upbeam or tulip")
     models = _models(model or [])
-    methods = _methods(models)
     first = next(iter(models.values()))
+    methods = _methods(models)
+    others, unets = _beside(beside or [], models, methods, passes)
     if protocol == "tulip":
         if report is not None or full or bands or columns or rows != "ring":
             raise UserError(
                 "--protocol tulip sets its own rows, columns and metrics: no --report, --full, --bands, ..."
             )
+        if drive:
+            raise UserError("--protocol tulip judges every frame of a folder: no --drive")
         _tulip(source, methods, first, frames, as_json=as_json)
         return
-    found = _source(source, first, frames, "ring" if rows == "ring" else "elevation", columns, seed)
+    found = _source(source, first, frames, "ring" if rows == "ring" else "elevation", columns, seed, drive or ())
     pictured: list[Frame] = []
 
     def keep_first(frame: Frame) -> None:
@@ -126,14 +143,16 @@ def evaluate(
         "source": source,
         "rows": found.rows,
         "columns": int(pictured[0].distance.shape[1]),
-        "models": {name: {"crc32": f"{m.crc32:08x}", "sensor": m.rules.sensor} for name, m in models.items()},
+        "models": {name: _model_dict(m) for name, m in {**models, **others}.items()},
+        **({"monte_carlo_passes": dict.fromkeys(unets, passes)} if unets else {}),
+        **({"drives": drive} if drive else {}),
         **evaluation_dict(result, first),
     }
     title = f"{source}: {len(result.frames)} frames, {found.rows} rows"
     if report is not None:
         from .evaluate_report import write_evaluation_report  # loads matplotlib
 
-        chosen = {name: methods[name] for name in (BASE, *models)}
+        chosen = {name: methods[name] for name in (BASE, *models, *(n for n in methods if n not in BASELINES))}
         tables = _tables(result, title, bands=True, full=full)
         path = write_evaluation_report(report, title, result, summary, tables, pictured[0], chosen, first.rules)
         message(f"report: {path}")
@@ -142,7 +161,15 @@ def evaluate(
     else:
         for part in _tables(result, title, bands=bands, full=full):
             show(_rich(part))
-        message(NOTE)
+        message(NOTE + (f" {', '.join(unets)}: {passes} Monte-Carlo passes." if unets else ""))
+
+
+def _model_dict(model: Model) -> dict[str, Any]:
+    return {
+        "crc32": f"{model.crc32:08x}",
+        "sensor": model.rules.sensor,
+        "multiply_adds_per_window": model.file.folded[0].multiply_adds,
+    }
 
 
 def evaluate_folder(folder: str, model: Model) -> Evaluation:
@@ -191,6 +218,46 @@ def _models(paths: Sequence[str]) -> dict[str, Model]:
     return models
 
 
+def _beside(
+    paths: Sequence[str], models: Mapping[str, Model], methods: dict[str, Method], passes: int
+) -> tuple[dict[str, Model], list[str]]:
+    """Adds the files' methods to ``methods`` by their stems; gives the models among them, and the U-Nets' names."""
+    found: dict[str, Model] = {}
+    unets: list[str] = []
+    for path in paths:
+        name = Path(path).stem
+        if name in methods:
+            raise UserError(f"--with {path}: another method is called {name}; rename the file")
+        if Path(path).suffix != ".pt":
+            found[name] = load_model(path)
+            methods[name] = model_method(found[name])
+            continue
+        methods[name], is_unet = _torch_file(path, passes)
+        if is_unet:
+            unets.append(name)
+    return found, unets
+
+
+def _torch_file(path: str, passes: int) -> tuple[Method, bool]:
+    """The method of a .pt file of ``upbeam train``, and whether it is Shan's U-Net, which uses a GPU where there is
+    one."""
+    if not Path(path).is_file():
+        raise UserError(f"{path}: no such file")
+    try:
+        import torch  # noqa: F401
+    except ImportError:
+        raise UserError(f"{path} needs PyTorch: pip install 'upbeam[train]'") from None
+    from upbeam.model.shan import is_shan, load_shan, shan_method
+    from upbeam.model.train import networks_method, pick_device
+
+    if is_shan(path):
+        return shan_method(load_shan(path).to(pick_device("auto")), passes), True
+    try:
+        return networks_method(path), False
+    except NetworkError as error:
+        raise UserError(f"{error}; expected a file of upbeam train") from None
+
+
 def _methods(models: Mapping[str, Model]) -> dict[str, Method]:
     return {**BASELINES, **{name: model_method(model) for name, model in models.items()}}
 
@@ -198,17 +265,28 @@ def _methods(models: Mapping[str, Model]) -> dict[str, Method]:
 # --------------------------------------------------------------------------------------------------------- frames
 
 
-def _source(source: str, model: Model, limit: int | None, rows: RowRule, columns: int | None, seed: int) -> _Source:
+def _source(
+    source: str,
+    model: Model,
+    limit: int | None,
+    rows: RowRule,
+    columns: int | None,
+    seed: int,
+    drives: Sequence[str] = (),
+) -> _Source:
+    capture = Path(source).suffix.lower() in CAPTURES
+    if drives and (source == "sim" or capture or not Path(source).is_dir()):
+        raise UserError(f"--drive is of a folder of KITTI frames, {source} is none")
     if source == "sim":
         return _simulated(model, limit or 20, columns, seed)
-    if Path(source).suffix.lower() in CAPTURES:
+    if capture:
         from upbeam.model.recordings import capture_frames
 
         found = list(islice(capture_frames(source, columns=columns), limit))
         return _Source(found, len(found), "laser")
-    total = len(kitti_files(source))
-    found_frames = kitti_frames(source, model.rules, columns=columns, rows=rows)
-    return _Source(islice(found_frames, limit), min(total, limit or total), rows)
+    files = (kitti_files_of_drives(Path(source), drives) if drives else kitti_files(source))[:limit]
+    made = (frame for file in files for frame in kitti_frames(file, model.rules, columns=columns, rows=rows))
+    return _Source(made, len(files), rows)
 
 
 def _simulated(model: Model, count: int, columns: int | None, seed: int) -> _Source:

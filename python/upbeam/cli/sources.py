@@ -1,11 +1,12 @@
-"""Where frames come from: the simulator, or a folder of recorded ones. Handed down to training, evaluation and
+"""Where frames come from: the simulator, a folder of recorded ones, a capture. Handed down to training, evaluation and
 streams."""
 
 from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,22 @@ from upbeam.hw_sim import Scan, simulate_frames, simulate_parallel
 from upbeam.model.beams import BeamTable
 from upbeam.model.frames import Frame, bin_elevation_deg, kitti_files, kitti_frames
 from upbeam.model.geometry import bin_elevation, project
-from upbeam.model.recipe import DataRecipe, Recipe
+from upbeam.model.recipe import BaseRecipe, DataRecipe
+from upbeam.model.recordings import Capture, open_capture, training_frames
 from upbeam.model.rules import ROWS, Rules
 
 from .common import UserError
 
-__all__ = ["frame_of_scan", "recipe_frames", "recorded_frame_of_scan", "simulated_scans", "source_frames"]
+__all__ = [
+    "describe_source",
+    "frame_of_scan",
+    "kitti_files_of_drives",
+    "may_ship",
+    "recipe_frames",
+    "recorded_frame_of_scan",
+    "simulated_scans",
+    "source_frames",
+]
 
 
 def simulated_scans(
@@ -84,21 +95,70 @@ def recorded_frame_of_scan(scan: Scan, columns: int, cut_deg: float, *, elevatio
 
 
 def source_frames(source: DataRecipe) -> int:
-    """How many frames a source gives. Raises CloudError or UserError where a folder holds none."""
-    return source.frames if source.source == "simulator" else len(_kitti_files(source))
+    """How many frames a source gives. Raises CloudError or UserError where a folder or a capture holds none."""
+    if source.source == "simulator":
+        return source.frames
+    if source.source == "kitti":
+        return len(_kitti_files(source))
+    turns = _capture(source).stats.turns
+    return min(turns, source.frames or turns)
 
 
-def recipe_frames(recipe: Recipe, rules: Rules, sources: tuple[DataRecipe, ...] | None = None) -> Iterator[Frame]:
+def describe_source(source: DataRecipe) -> str:
+    """For a model's provenance."""
+    if source.source == "simulator":
+        how = "" if source.projection == "aligned" else f", projected as recordings are at {source.rate_hz:g} Hz"
+        return f"upbeam simulator, {source.frames} frames, seed {source.seed}{how}"
+    if source.source == "capture":
+        capture = _capture(source)
+        ship = "may ship" if source.may_ship else "may not ship"
+        return (
+            f"capture {capture.path.name} of a {capture.beams.name}, {source_frames(source)} turns, {source.hide} "
+            f"beams hidden (licence {source.licence or 'not stated'}; {ship})"
+        )
+    drives = f", only {', '.join(source.only_drives)}" if source.only_drives else ""
+    drives += f", without {', '.join(source.without_drives)}" if source.without_drives else ""
+    return f"KITTI-format recordings, {source_frames(source)} frames{drives} (non-commercial licence)"
+
+
+def may_ship(source: DataRecipe) -> bool:
+    """Weights trained on it may be shipped under our licence."""
+    return source.source == "simulator" or source.may_ship
+
+
+def recipe_frames(recipe: BaseRecipe, rules: Rules, sources: tuple[DataRecipe, ...] | None = None) -> Iterator[Frame]:
     """The frames of ``sources``: those a recipe trains on unless told otherwise."""
     for source in recipe.data if sources is None else sources:
         if source.source == "kitti":
             for path in _kitti_files(source):
                 yield from kitti_frames(path, rules, rows=recipe.rows)
+        elif source.source == "capture":
+            width = source.columns or recipe.columns
+            frames = training_frames(_capture(source), rules, columns=width, hide=source.hide)
+            yield from islice(frames, source.frames or None)
         else:
             yield from _simulated_frames(source, recipe, rules)
 
 
-def _simulated_frames(source: DataRecipe, recipe: Recipe, rules: Rules) -> Iterator[Frame]:
+def _capture(source: DataRecipe) -> Capture:
+    if Path(source.path).suffix.lower() == ".bag":
+        raise UserError(f"{source.path}: a ROS 1 bag; rosbags-convert makes a ROS 2 bag of it, whose .db3 is read")
+    places = [Path(source.path)]
+    if os.environ.get("UPBEAM_DATA") and not places[0].is_absolute():
+        places.append(Path(os.environ["UPBEAM_DATA"]) / source.path)
+    for place in places:
+        if place.is_file():
+            return _opened(place.resolve(), place.stat().st_mtime_ns, source.sensor or None)
+    raise UserError(f"no capture {' nor '.join(map(str, places))} (a path may begin in the folder UPBEAM_DATA names)")
+
+
+@lru_cache(maxsize=2)
+def _opened(path: Path, changed_ns: int, sensor: str | None) -> Capture:
+    """Counting a capture's turns means reading it; ``changed_ns`` tells another file of the same name."""
+    return open_capture(path, sensor=sensor)
+
+
+def _simulated_frames(source: DataRecipe, recipe: BaseRecipe, rules: Rules) -> Iterator[Frame]:
     beams, columns = recipe.simulated_beams(), source.columns or recipe.columns
     same: dict[str, Any] = {"frames": source.frames, "seed": source.seed, "frames_per_scene": source.frames_per_scene}
     if source.projection == "aligned":
@@ -111,17 +171,24 @@ def _simulated_frames(source: DataRecipe, recipe: Recipe, rules: Rules) -> Itera
 def _kitti_files(source: DataRecipe) -> list[Path]:
     """The source's files in name order, of the drives it asks for; at most ``frames`` of them if that is above 0."""
     folder = Path(source.folder) if source.folder else _default_folder()
+    files = kitti_files_of_drives(folder, source.only_drives, source.without_drives)
+    return files[: source.frames or None]
+
+
+def kitti_files_of_drives(folder: Path, only: Sequence[str] = (), without: Sequence[str] = ()) -> list[Path]:
+    """A folder's files in name order, of the drives of its ``drives.tsv`` that are asked for. Raises UserError for a
+    drive it does not name, or where no file is left."""
     files = kitti_files(folder)
     drives = _drives(folder)
-    for name in (*source.only_drives, *source.without_drives):
+    for name in (*only, *without):
         if name not in drives.values():
-            raise UserError(f"{folder / 'drives.tsv'}: no frame of drive {name!r}, which the recipe names")
-    if source.only_drives:
-        files = [path for path in files if drives.get(path.stem) in source.only_drives]
-    files = [path for path in files if drives.get(path.stem) not in source.without_drives]
+            raise UserError(f"{folder / 'drives.tsv'}: no frame of drive {name!r}, which was asked for")
+    if only:
+        files = [path for path in files if drives.get(path.stem) in only]
+    files = [path for path in files if drives.get(path.stem) not in without]
     if not files:
-        raise UserError(f"{folder}: no frame is left of the drives the recipe asks for")
-    return list(islice(files, source.frames or None))
+        raise UserError(f"{folder}: no frame is left of the drives that were asked for")
+    return files
 
 
 def _default_folder() -> Path:
