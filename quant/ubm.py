@@ -25,7 +25,7 @@ from .ubm_integer import INTEGER_TAGS, pack_integer, parse_integer
 __all__ = ["MAX_FILE_BYTES", "ModelFile", "UbmError", "read_ubm", "write_ubm"]
 
 MAGIC = b"UPBM"
-VERSION = 0
+VERSION = 1
 HEADER_BYTES = 32
 MAX_FILE_BYTES = 1 << 20
 MAX_SECTIONS = 32

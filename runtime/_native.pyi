@@ -24,6 +24,7 @@ class Stream:
     def __init__(
         self,
         model: Model,
+        precision: str = "fp32",
         cpu: str = "auto",
         columns: int = 0,
         distance_unit_um: int = 0,
@@ -55,6 +56,34 @@ def raw_windows(
     """
     Outputs of both networks before rounding and validity for aligned columns [n, 32]: counts and intensities [n, 32], of each column the last without meaning. Both ends are edges.
     """
+
+def windows_int(
+    model: Model,
+    precision: str,
+    distance: Annotated[NDArray[numpy.uint16], dict(shape=(None, None), order="C", device="cpu", writable=False)],
+    intensity: Annotated[NDArray[numpy.uint8], dict(shape=(None, None), order="C", device="cpu", writable=False)],
+    cpu: str = "auto",
+) -> tuple:
+    """
+    What an integer kernel generates for aligned columns [n, 32]: counts and intensities [n, 32], of each column the last is 0. Both ends are edges.
+    """
+
+def trace_int(
+    model: Model,
+    precision: str,
+    network: str,
+    windows: Annotated[NDArray[numpy.uint16], dict(shape=(None, None), order="C", device="cpu", writable=False)],
+) -> dict:
+    """
+    The steps m, d, s, q, S, a, z, Y, r, y of docs/numeric-contract.md for windows [n, 6] of one network, 'distance' or 'intensity': int32 arrays [n, 1], [n, 6] or [n, hidden units, padded to an even number].
+    """
+
+def sizes(model: Model, precision: str, columns: int = 0, aligned: bool = False) -> dict:
+    """Bytes of file, weights, tables, state and ring: see upb_sizes."""
+
+CPUS: tuple = ...
+
+PRECISIONS: tuple = ("fp32", "int16", "int8")
 
 class LiveConfig:
     """Settings of a run: see upb_live.h."""

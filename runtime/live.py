@@ -20,7 +20,7 @@ from upbeam.model.rules import BEAMS
 from ._native import LiveConfig as NativeConfig
 from ._native import LiveRun as NativeRun
 from ._native import live_explains
-from .upsampler import Model
+from .upsampler import CPUS, PRECISIONS, Model, need_precision
 
 __all__ = [
     "LiveConfig",
@@ -39,10 +39,8 @@ U8 = NDArray[np.uint8]
 
 VERDICTS = ("met", "missed", "partial")
 MODES = ("network",)
-_CPUS = ("auto", "scalar", "avx2", "avx512", "neon")
-_PRECISIONS = ("fp32", "int16", "int8")
 _WAITS = ("block", "poll")
-_CHOICES = {"clock": ("real", "virtual"), "precision": _PRECISIONS, "cpu": _CPUS, "wait": _WAITS}
+_CHOICES = {"clock": ("real", "virtual"), "precision": PRECISIONS, "cpu": CPUS, "wait": _WAITS}
 _POLL_S = 0.1
 _NS_PER_US = 1000
 _NS_PER_MS = 1_000_000
@@ -64,8 +62,9 @@ class LiveConfig:
     """From the last input column to the last output column, above 0."""
     clock: Literal["real", "virtual"] = "real"
     precision: str = "fp32"
+    """``fp32``, or ``int16`` or ``int8`` where the model has it."""
     cpu: str = "auto"
-    """Force an instruction set: ``scalar``, ``avx2``, ``avx512``, ``neon``."""
+    """Force an instruction set, one of ``upsampler.CPUS``."""
     aligned: bool = False
     """The columns are destaggered already: all beams of a column share its azimuth."""
     any_sensor: bool = False
@@ -195,6 +194,7 @@ class LiveResult:
     witnesses: int
     witnesses_bound: int
     """Witness threads that are bound to a core each."""
+    precision: str
     cpu: str
     """The instruction set in use."""
     delay_columns: int
@@ -239,6 +239,10 @@ def run_live(
     arrays that do not fit.
     """
     config = config or LiveConfig()
+    try:
+        need_precision(model, config.precision)
+    except ValueError as error:
+        raise LiveConfigError(str(error)) from None
     distance, intensity = _check_frames(model, frames_distance, frames_intensity, config)
     total = config.frames or len(distance)
     native = NativeRun(
@@ -311,8 +315,8 @@ def _native_config(config: LiveConfig, total: int) -> NativeConfig:
     native.lock_memory = config.lock_memory
     native.witness = config.witness
     native.stall_threshold_ns = round(config.stall_threshold_ms * _NS_PER_MS)
-    native.precision = _PRECISIONS.index(config.precision)
-    native.cpu = _CPUS.index(config.cpu)
+    native.precision = PRECISIONS.index(config.precision)
+    native.cpu = CPUS.index(config.cpu)
     native.any_sensor = config.any_sensor
     native.aligned = config.aligned
     if config.clock == "virtual":
@@ -415,7 +419,8 @@ def _result(raw: dict[str, Any], config: LiveConfig, columns: int) -> LiveResult
         stalls_unlisted=raw["stalls_unlisted"],
         witnesses=raw["witnesses"],
         witnesses_bound=raw["witnesses_bound"],
-        cpu=_CPUS[raw["cpu"]],
+        precision=config.precision,
+        cpu=CPUS[raw["cpu"]],
         delay_columns=raw["delay_columns"],
         state_bytes=raw["state_bytes"],
         stream_bytes=raw["stream_bytes"],

@@ -14,11 +14,14 @@ from upbeam.model.geometry import to_counts, to_metres
 from upbeam.model.rules import BEAMS, ROWS, Rules
 from upbeam.quant.ubm import ModelFile, UbmError, read_ubm
 
+from ._native import CPUS, PRECISIONS
 from ._native import Model as NativeModel
 from ._native import Stream as NativeStream
+from ._native import sizes as native_sizes
 
 __all__ = [
     "BACKENDS",
+    "CPUS",
     "PRECISIONS",
     "ColumnStream",
     "Columns",
@@ -26,6 +29,7 @@ __all__ = [
     "Upsampler",
     "generated_rows",
     "load_model",
+    "need_precision",
     "shipped_models",
 ]
 
@@ -33,8 +37,6 @@ U16 = NDArray[np.uint16]
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 
-PRECISIONS = ("fp32",)
-"""Of this version; ``int16`` and ``int8`` need the integer contract."""
 DEFAULT_MODEL = "hdl-64e"
 BACKENDS = ("cpu",)
 """Of this version."""
@@ -43,9 +45,10 @@ BACKENDS = ("cpu",)
 class Model:
     """A model file, parsed twice: by Python (for people and tools) and by the C runtime (which computes with it)."""
 
-    def __init__(self, data: bytes) -> None:
-        """Raises UbmError for bytes that are not a sound model."""
+    def __init__(self, data: bytes, name: str = "the model") -> None:
+        """``name`` is what messages call it. Raises UbmError for bytes that are not a sound model."""
         self.data = data
+        self.name = name
         self.file: ModelFile = read_ubm(data)
         self.native = NativeModel(data)
         self.info: dict[str, Any] = self.native.info()
@@ -69,8 +72,33 @@ class Model:
         """The file's checksum: the model's identity in reports."""
         return int(self.info["crc32"])
 
+    @property
+    def precisions(self) -> tuple[str, ...]:
+        """What it can compute with: ``fp32``, and those of ``int16`` and ``int8`` that the file has."""
+        return tuple(self.info["precisions"])
+
+    def sizes(self, precision: str = "fp32", *, columns: int | None = None, aligned: bool = False) -> dict[str, int]:
+        """Bytes, from the C runtime: the ``file``; the ``weights`` of the precision, as the file holds them; the
+        ``tables`` they become in memory; the ``state`` of a stream, and the destagger ``ring`` that is part of it.
+
+        Raises ValueError for a precision that the model does not have.
+        """
+        need_precision(self, precision)
+        return native_sizes(self.native, precision, columns=columns or 0, aligned=aligned)
+
     def __repr__(self) -> str:
         return f"Model({self.rules.sensor!r}, {self.columns} columns, crc32 {self.crc32:08x})"
+
+
+def need_precision(model: Model, precision: str) -> None:
+    """Raises ValueError for a name that is no precision, and for one that the model file does not have."""
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision {precision!r} is unknown, expected one of: {', '.join(PRECISIONS)}")
+    if precision not in model.precisions:
+        raise ValueError(
+            f"precision {precision} is not in {model.name}, only {', '.join(model.precisions)}: "
+            "`upbeam quantize` makes a model file that has it"
+        )
 
 
 def shipped_models() -> list[str]:
@@ -85,12 +113,12 @@ def load_model(path: str | Path | None = None) -> Model:
     Raises UbmError naming the file."""
     name = str(path) if path is not None else DEFAULT_MODEL
     if name in shipped_models():
-        return Model(resources.files("upbeam.quant").joinpath("models").joinpath(f"{name}.ubm").read_bytes())
+        return Model(resources.files("upbeam.quant").joinpath("models").joinpath(f"{name}.ubm").read_bytes(), name)
     if Path(name).suffix != ".ubm" and not Path(name).exists():
         raise UbmError(f"{name}: no such model; shipped are {', '.join(shipped_models())}, or give a .ubm file")
     read_ubm(name)  # its errors name the file
     try:
-        return Model(Path(name).read_bytes())
+        return Model(Path(name).read_bytes(), name)
     except ValueError as error:
         raise UbmError(f"{name}: {error}") from None
 
@@ -134,10 +162,12 @@ class Upsampler:
         columns: int | None = None,
         cpu: str = "auto",
     ) -> None:
-        """``columns``: width of the images where it is not the model's. ``cpu``: force ``scalar``, ``avx2``,
-        ``avx512``, ``neon``."""
-        if precision not in PRECISIONS:
-            raise ValueError(f"precision {precision!r} is not available, expected one of: {', '.join(PRECISIONS)}")
+        """``precision``: ``fp32``, ``int16`` or ``int8``; the integers give the same bits on every machine.
+        ``columns``: width of the images where it is not the model's. ``cpu``: force one of ``CPUS``.
+
+        Raises ValueError for what the model, this machine or this version does not have.
+        """
+        need_precision(model, precision)
         if backend not in BACKENDS:
             raise ValueError(f"backend {backend!r} is not available, expected one of: {', '.join(BACKENDS)}")
         self.model = model
@@ -146,7 +176,12 @@ class Upsampler:
         self.columns = columns or model.columns
         self._cpu = cpu
         self._stream = NativeStream(
-            model.native, cpu=cpu, columns=self.columns, any_sensor=columns is not None, aligned=True
+            model.native,
+            precision=precision,
+            cpu=cpu,
+            columns=self.columns,
+            any_sensor=columns is not None,
+            aligned=True,
         )
 
     @property
@@ -180,7 +215,7 @@ class Upsampler:
 
     def stream(self, *, aligned: bool = False) -> ColumnStream:
         """A column stream. ``aligned``: the columns are destaggered already."""
-        return ColumnStream(self.model, columns=self.columns, cpu=self._cpu, aligned=aligned)
+        return ColumnStream(self.model, self.precision, columns=self.columns, cpu=self._cpu, aligned=aligned)
 
     def _check(self, distance: NDArray[Any], intensity: NDArray[Any]) -> None:
         shape = (BEAMS, self.columns)
@@ -196,10 +231,26 @@ class Upsampler:
 class ColumnStream:
     """A sensor that keeps turning: columns in, finished columns out, a few columns behind."""
 
-    def __init__(self, model: Model, *, columns: int | None = None, cpu: str = "auto", aligned: bool = False) -> None:
+    def __init__(
+        self,
+        model: Model,
+        precision: str = "fp32",
+        *,
+        columns: int | None = None,
+        cpu: str = "auto",
+        aligned: bool = False,
+    ) -> None:
+        """As ``Upsampler``. ``aligned``: the columns are destaggered already."""
+        need_precision(model, precision)
         self.model = model
+        self.precision = precision
         self._stream = NativeStream(
-            model.native, cpu=cpu, columns=columns or 0, any_sensor=columns is not None, aligned=aligned
+            model.native,
+            precision=precision,
+            cpu=cpu,
+            columns=columns or 0,
+            any_sensor=columns is not None,
+            aligned=aligned,
         )
 
     def push(self, distance: U16, intensity: U8, column: int) -> Columns:

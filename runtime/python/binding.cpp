@@ -9,6 +9,7 @@
 
 #include <cstdlib>
 #include <cstring>
+#include <iterator>
 #include <mutex>
 #include <optional>
 #include <vector>
@@ -23,8 +24,9 @@ std::string describe(upb_status status, const upb_error *error) {
     if (error == nullptr || error->what[0] == '\0')
         return text;
     text = std::string(error->what) + ": " + text;
-    if (error->got != 0 || error->expected != 0)
-        text += " (got " + std::to_string(error->got) + ", expected " + std::to_string(error->expected) + ")";
+    if (error->got != 0 || error->expected != 0) // values of signed fields are there as two's complement
+        text += " (got " + std::to_string(static_cast<int64_t>(error->got)) + ", expected " +
+                std::to_string(static_cast<int64_t>(error->expected)) + ")";
     if (error->offset != 0)
         text += " at byte " + std::to_string(error->offset);
     return text;
@@ -60,23 +62,37 @@ namespace {
 using DistanceIn = nb::ndarray<const uint16_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using IntensityIn = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
-upb_cpu cpu_from_name(const std::string &name) {
-    if (name == "auto")
-        return UPB_CPU_AUTO;
-    if (name == "scalar")
-        return UPB_CPU_SCALAR;
-    if (name == "avx2")
-        return UPB_CPU_AVX2;
-    if (name == "avx512")
-        return UPB_CPU_AVX512;
-    if (name == "neon")
-        return UPB_CPU_NEON;
-    throw NativeError("unknown instruction set '" + name + "', expected auto, scalar, avx2, avx512 or neon");
+// In the order of upb_cpu and of upb_precision.
+constexpr const char *cpu_names[] = {"auto", "scalar", "avx2", "avx512", "neon", "avx512-vnni", "neon-dot"};
+constexpr const char *precision_names[] = {"fp32", "int16", "int8"};
+
+template <size_t N> uint32_t index_of(const char *const (&names)[N], const std::string &name, const char *what) {
+    std::string expected;
+    for (size_t i = 0; i < N; ++i) {
+        if (name == names[i])
+            return static_cast<uint32_t>(i);
+        expected += (i ? ", " : "") + std::string(names[i]);
+    }
+    throw NativeError("unknown " + std::string(what) + " '" + name + "', expected one of: " + expected);
 }
 
-const char *cpu_name(uint32_t cpu) {
-    static const char *const names[] = {"auto", "scalar", "avx2", "avx512", "neon"};
-    return cpu < 5 ? names[cpu] : "?";
+upb_cpu cpu_from_name(const std::string &name) {
+    return static_cast<upb_cpu>(index_of(cpu_names, name, "instruction set"));
+}
+
+upb_precision precision_from_name(const std::string &name) {
+    return static_cast<upb_precision>(index_of(precision_names, name, "precision"));
+}
+
+const char *cpu_name(uint32_t cpu) { return cpu < std::size(cpu_names) ? cpu_names[cpu] : "?"; }
+
+const char *precision_name(uint32_t p) { return p < std::size(precision_names) ? precision_names[p] : "?"; }
+
+template <size_t N> nb::tuple name_tuple(const char *const (&names)[N]) {
+    nb::list list;
+    for (const char *name : names)
+        list.append(name);
+    return nb::tuple(list);
 }
 
 // A [rows, width] array that owns `data`.
@@ -95,11 +111,14 @@ void need_shape(const char *what, size_t rows, size_t columns, size_t want_rows,
 // A column stream. A mutex keeps two Python threads out of it while the GIL is released.
 class StreamHandle {
   public:
-    StreamHandle(const ModelHandle &model, const std::string &cpu, uint32_t columns, uint32_t distance_unit_um,
-                 bool any_sensor, bool aligned)
-        : memory_(bytes(model, config(cpu, columns, distance_unit_um, any_sensor, aligned))) {
+    StreamHandle(const ModelHandle &model, const std::string &precision, const std::string &cpu, uint32_t columns,
+                 uint32_t distance_unit_um, bool any_sensor, bool aligned)
+        : StreamHandle(model, config(precision, cpu, columns, distance_unit_um, any_sensor, aligned), columns) {}
+
+    StreamHandle(const ModelHandle &model, upb_stream_config c, uint32_t columns) : memory_(bytes(model, c)) {
         upb_error error = {};
-        const upb_stream_config c = config(cpu, columns, distance_unit_um, any_sensor, aligned);
+        c.sink = &StreamHandle::sink;
+        c.user = this;
         columns_ = columns != 0 ? columns : model.info().columns;
         check(upb_stream_init(memory_.get(), memory_.bytes(), model.model(), &c, &stream_, &error), &error);
     }
@@ -178,6 +197,7 @@ class StreamHandle {
         d["frames_out"] = s.frames_out;
         d["delay_columns"] = s.delay_columns;
         d["cpu"] = cpu_name(s.cpu);
+        d["precision"] = precision_name(s.precision);
         d["state_bytes"] = s.state_bytes;
         d["memory_bytes"] = memory_.bytes();
         return d;
@@ -206,15 +226,15 @@ class StreamHandle {
         out->place.insert(out->place.end(), {column->frame, column->column, column->flags});
     }
 
-    upb_stream_config config(const std::string &cpu, uint32_t columns, uint32_t unit, bool any_sensor, bool aligned) {
+    static upb_stream_config config(const std::string &precision, const std::string &cpu, uint32_t columns,
+                                    uint32_t unit, bool any_sensor, bool aligned) {
         upb_stream_config c = upb_stream_config_default();
+        c.precision = static_cast<uint32_t>(precision_from_name(precision));
         c.cpu = static_cast<uint32_t>(cpu_from_name(cpu));
         c.columns = columns;
         c.distance_unit_um = unit;
         c.any_sensor = any_sensor ? 1u : 0u;
         c.aligned = aligned ? 1u : 0u;
-        c.sink = &StreamHandle::sink;
-        c.user = this;
         return c;
     }
 
@@ -261,6 +281,78 @@ nb::tuple raw_windows(const ModelHandle &model, const DistanceIn &distance, cons
     return nb::make_tuple(d_out, i_out);
 }
 
+nb::tuple int_windows(const ModelHandle &model, const std::string &precision, const DistanceIn &distance,
+                      const IntensityIn &intensity, const std::string &cpu) {
+    const size_t n = distance.shape(0);
+    need_shape("distance", n, distance.shape(1), n, UPB_BEAMS);
+    need_shape("intensity", intensity.shape(0), intensity.shape(1), n, UPB_BEAMS);
+    auto *d = new std::vector<uint16_t>(n * UPB_BEAMS);
+    auto d_out = own(d, n, UPB_BEAMS);
+    auto *i = new std::vector<uint8_t>(n * UPB_BEAMS);
+    auto i_out = own(i, n, UPB_BEAMS);
+    const upb_precision p = precision_from_name(precision);
+    const upb_cpu c = cpu_from_name(cpu);
+    upb_status status;
+    {
+        nb::gil_scoped_release release;
+        status = upb_int_windows(model.model(), p, c, static_cast<uint32_t>(n), distance.data(), intensity.data(),
+                                 d->data(), i->data());
+    }
+    check(status);
+    return nb::make_tuple(d_out, i_out);
+}
+
+nb::dict trace_int(const ModelHandle &model, const std::string &precision, const std::string &network,
+                   const DistanceIn &windows) {
+    constexpr const char *networks[] = {"distance", "intensity"};
+    const upb_precision p = precision_from_name(precision);
+    const int which = static_cast<int>(index_of(networks, network, "network"));
+    const size_t n = windows.shape(0);
+    need_shape("windows", n, windows.shape(1), n, 6);
+    std::vector<upb_int_steps> steps(n + 1); // one more: it tells the width where there is no window
+    const uint16_t zeros[6] = {};
+    for (size_t i = 0; i <= n; ++i)
+        check(upb_int_trace_window(model.model(), p, which, i < n ? windows.data() + 6 * i : zeros, &steps[i]));
+    nb::dict out;
+    // `first` gives the place of a step in a trace, [width].
+    auto put = [&](const char *name, size_t width, auto first) {
+        auto *values = new std::vector<int32_t>;
+        for (size_t i = 0; i < n; ++i)
+            values->insert(values->end(), first(steps[i]), first(steps[i]) + width);
+        out[name] = own(values, n, width);
+    };
+    const size_t hidden = steps[n].hidden;
+    put("m", 1, [](const upb_int_steps &s) { return &s.m; });
+    put("d", 6, [](const upb_int_steps &s) { return s.d; });
+    put("s", 1, [](const upb_int_steps &s) { return &s.s; });
+    put("q", 6, [](const upb_int_steps &s) { return s.q; });
+    put("S", hidden, [](const upb_int_steps &s) { return s.S; });
+    put("a", hidden, [](const upb_int_steps &s) { return s.a; });
+    put("z", hidden, [](const upb_int_steps &s) { return s.z; });
+    put("Y", 1, [](const upb_int_steps &s) { return &s.Y; });
+    put("r", 1, [](const upb_int_steps &s) { return &s.r; });
+    put("y", 1, [](const upb_int_steps &s) { return &s.y; });
+    return out;
+}
+
+nb::dict sizes_dict(const ModelHandle &model, const std::string &precision, uint32_t columns, bool aligned) {
+    upb_stream_config c = upb_stream_config_default();
+    upb_sizes sizes = {};
+    upb_error error = {};
+    c.precision = static_cast<uint32_t>(precision_from_name(precision));
+    c.columns = columns;
+    c.any_sensor = columns != 0 ? 1u : 0u;
+    c.aligned = aligned ? 1u : 0u;
+    check(upb_stream_sizes(model.model(), &c, &sizes, &error), &error);
+    nb::dict d;
+    d["file"] = sizes.file;
+    d["weights"] = sizes.weights;
+    d["tables"] = sizes.tables;
+    d["state"] = sizes.state;
+    d["ring"] = sizes.ring;
+    return d;
+}
+
 nb::dict info_dict(const ModelHandle &model) {
     const upb_model_info info = model.info();
     nb::dict d;
@@ -275,6 +367,13 @@ nb::dict info_dict(const ModelHandle &model) {
     d["empty_rule"] = info.empty_rule;
     d["hidden"] = nb::make_tuple(info.hidden[0], info.hidden[1]);
     d["crc32"] = info.crc32;
+    d["file_bytes"] = info.file_bytes;
+    d["signature_bytes"] = info.signature_bytes;
+    nb::list precisions;
+    for (uint32_t p = 0; p < UPB_PRECISIONS; ++p)
+        if (info.precisions >> p & 1u)
+            precisions.append(precision_name(p));
+    d["precisions"] = nb::tuple(precisions);
     d["row_elevation_udeg"] = std::vector<int32_t>(info.row_elevation_udeg, info.row_elevation_udeg + UPB_ROWS);
     d["azimuth_offset_udeg"] = std::vector<int32_t>(info.azimuth_offset_udeg, info.azimuth_offset_udeg + UPB_BEAMS);
     return d;
@@ -291,9 +390,9 @@ NB_MODULE(_native, m) {
         .def(nb::init<const nb::bytes &>(), "ubm"_a)
         .def("info", &info_dict);
     nb::class_<StreamHandle>(m, "Stream", "A column stream over a model.")
-        .def(nb::init<const ModelHandle &, const std::string &, uint32_t, uint32_t, bool, bool>(), "model"_a,
-             "cpu"_a = "auto", "columns"_a = 0, "distance_unit_um"_a = 0, "any_sensor"_a = false, "aligned"_a = false,
-             nb::keep_alive<1, 2>())
+        .def(nb::init<const ModelHandle &, const std::string &, const std::string &, uint32_t, uint32_t, bool, bool>(),
+             "model"_a, "precision"_a = "fp32", "cpu"_a = "auto", "columns"_a = 0, "distance_unit_um"_a = 0,
+             "any_sensor"_a = false, "aligned"_a = false, nb::keep_alive<1, 2>())
         .def("image", &StreamHandle::image, "distance"_a, "intensity"_a)
         .def("push", &StreamHandle::push, "distance"_a, "intensity"_a, "column"_a)
         .def("gap", &StreamHandle::gap, "columns"_a)
@@ -304,5 +403,16 @@ NB_MODULE(_native, m) {
           "Outputs of both networks before rounding and validity for aligned columns [n, 32]: counts and intensities "
           "[n, 32], "
           "of each column the last without meaning. Both ends are edges.");
+    m.def(
+        "windows_int", &int_windows, "model"_a, "precision"_a, "distance"_a, "intensity"_a, "cpu"_a = "auto",
+        "What an integer kernel generates for aligned columns [n, 32]: counts and intensities [n, 32], of each column "
+        "the last is 0. Both ends are edges.");
+    m.def("trace_int", &trace_int, "model"_a, "precision"_a, "network"_a, "windows"_a,
+          "The steps m, d, s, q, S, a, z, Y, r, y of docs/numeric-contract.md for windows [n, 6] of one network, "
+          "'distance' or 'intensity': int32 arrays [n, 1], [n, 6] or [n, hidden units, padded to an even number].");
+    m.def("sizes", &sizes_dict, "model"_a, "precision"_a, "columns"_a = 0, "aligned"_a = false,
+          "Bytes of file, weights, tables, state and ring: see upb_sizes.");
+    m.attr("CPUS") = name_tuple(cpu_names);
+    m.attr("PRECISIONS") = name_tuple(precision_names);
     bind_live(m);
 }

@@ -16,9 +16,10 @@ static const char status_text[][64] = {
     "a required section of the model file is unusable",
     "a value in the model file is impossible",
     "the stream's sensor is not the one the model was made for",
-    "the precision is not in the model or not in this build",
+    "the model file does not have the precision",
     "this machine or this build lacks the instruction set",
     "the column is older than one already taken",
+    "the model file's signature was refused",
 };
 
 const char *upb_status_text(upb_status status) {

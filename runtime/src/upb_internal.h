@@ -10,8 +10,19 @@
 
 struct upb_model {
     upb_model_f32 f32;
+    upb_model_int integer[UPB_PRECISIONS - 1]; /* of INT16, INT8; networks are zeros where the file has none */
     upb_model_info info;
 };
+
+/* True if the model file has the precision. */
+static inline int upb_model_has(const upb_model *model, uint32_t precision) {
+    return (model->info.precisions >> precision & 1) != 0;
+}
+
+/* The model of an integer precision. */
+static inline const upb_model_int *upb_model_integer(const upb_model *model, uint32_t precision) {
+    return &model->integer[precision - UPB_PRECISION_INT16];
+}
 
 /* Fills `error` unless it is null, and returns `status`. `what` is cut to fit. */
 upb_status upb_fail(upb_error *error, upb_status status, const char *what, uint64_t offset, uint64_t got,

@@ -34,13 +34,21 @@ typedef struct place {
     uint32_t column;
 } place;
 
+/* Three that rotate (left, middle, right of the window), and one that stays 0: beyond an edge. */
+enum { PREPARED_COLUMNS = 4, EMPTY_COLUMN = 3 };
+
+/* The memory of a stream: this; prepared columns, float or integer; the ring. */
 struct upb_stream {
-    upb_prepared_f32 prepared[3]; /* rotating: left, middle, right of the window */
-    upb_prepared_f32 empty;       /* stays 0: beyond an edge */
-    uint16_t out_distance[UPB_ROWS];
+    _Alignas(UPB_ALIGN) uint16_t out_distance[UPB_ROWS];
     uint8_t out_intensity[UPB_ROWS];
-    upb_kernels kernels;
+    upb_prepare_f32_fn prepare_f32;
+    upb_windows_f32_fn windows_f32;
+    upb_prepare_int_fn prepare_int;
+    upb_windows_int_fn windows_int; /* of the precision */
     const upb_model *model;
+    const upb_model_int *integer; /* of the precision; null: float */
+    unsigned char *prepared;      /* [PREPARED_COLUMNS] upb_prepared_int if `integer`, else upb_prepared_f32 */
+    size_t prepared_bytes;        /* of each */
     upb_column_sink sink;
     void *user;
     uint32_t columns;
@@ -57,8 +65,8 @@ struct upb_stream {
 
     /* azimuth columns of this segment */
     place next;     /* the next one to complete */
-    uint32_t spare; /* prepared[] that the next one goes to */
-    const upb_prepared_f32 *left, *middle;
+    uint32_t spare; /* prepared column that the next one goes to */
+    const void *left, *middle;
     uint32_t pending; /* `middle` waits for its right neighbour; its own rows lie in out_* already */
     uint32_t pending_flags;
     place pending_place;
@@ -109,6 +117,11 @@ static destagger plan_destagger(const upb_model_info *info, const upb_stream_con
     return plan;
 }
 
+/* Prepared columns of a precision. */
+static size_t prepared_bytes(uint32_t precision) {
+    return precision == UPB_PRECISION_FP32 ? sizeof(upb_prepared_f32) : sizeof(upb_prepared_int);
+}
+
 static size_t ring_bytes(const destagger *plan) { return plan->slots > 1 ? plan->slots * sizeof(ring_slot) : 0; }
 
 static upb_status bad_argument(upb_error *error, const char *what, uint64_t got, uint64_t expected) {
@@ -132,8 +145,8 @@ static upb_status check_config(const upb_model *model, const upb_stream_config *
         return bad_argument(error, "struct_bytes", config->struct_bytes, sizeof *config);
     if (config->precision > UPB_PRECISION_INT8)
         return bad_argument(error, "precision", config->precision, UPB_PRECISION_INT8);
-    if (config->cpu > UPB_CPU_NEON)
-        return bad_argument(error, "cpu", config->cpu, UPB_CPU_NEON);
+    if (config->cpu > UPB_CPU_NEON_DOT)
+        return bad_argument(error, "cpu", config->cpu, UPB_CPU_NEON_DOT);
     if (config->any_sensor > 1)
         return bad_argument(error, "any_sensor", config->any_sensor, 1);
     if (config->aligned > 1)
@@ -147,8 +160,8 @@ static upb_status check_config(const upb_model *model, const upb_stream_config *
     const uint32_t reorder_most = columns_of(&model->info, config) / 2;
     if (config->reorder_columns > reorder_most)
         return bad_argument(error, "reorder_columns", config->reorder_columns, reorder_most);
-    if (config->precision != UPB_PRECISION_FP32)
-        return upb_fail(error, UPB_E_PRECISION, "precision", 0, config->precision, UPB_PRECISION_FP32);
+    if (!upb_model_has(model, config->precision))
+        return upb_fail(error, UPB_E_PRECISION, "precision", 0, config->precision, model->info.precisions);
     upb_kernels kernels;
     if (upb_kernels_select(&kernels, (upb_cpu)config->cpu) == UPB_CPU_AUTO)
         return upb_fail(error, UPB_E_CPU, "cpu", 0, config->cpu, upb_kernels_select(&kernels, UPB_CPU_AUTO));
@@ -162,8 +175,30 @@ upb_status upb_stream_bytes(const upb_model *model, const upb_stream_config *con
     if (!bytes)
         return bad_argument(error, "bytes", 0, 0);
     const destagger plan = plan_destagger(&model->info, config);
-    *bytes = sizeof(upb_stream) + ring_bytes(&plan);
+    *bytes = sizeof(upb_stream) + PREPARED_COLUMNS * prepared_bytes(config->precision) + ring_bytes(&plan);
     return UPB_OK;
+}
+
+upb_status upb_stream_sizes(const upb_model *model, const upb_stream_config *config, upb_sizes *sizes,
+                            upb_error *error) {
+    size_t bytes;
+    upb_status status = upb_stream_bytes(model, config, &bytes, error);
+    if (status != UPB_OK)
+        return status;
+    if (!sizes)
+        return bad_argument(error, "sizes", 0, 0);
+    const destagger plan = plan_destagger(&model->info, config);
+    memset(sizes, 0, sizeof *sizes);
+    sizes->file = model->info.file_bytes;
+    sizes->weights = model->info.weight_bytes[config->precision];
+    sizes->tables = config->precision == UPB_PRECISION_FP32 ? sizeof(upb_model_f32) : sizeof(upb_model_int);
+    sizes->state = (uint32_t)bytes;
+    sizes->ring = (uint32_t)ring_bytes(&plan);
+    return UPB_OK;
+}
+
+static const void *empty_column(const upb_stream *stream) {
+    return stream->prepared + EMPTY_COLUMN * stream->prepared_bytes;
 }
 
 /* Begins a segment whose columns will be numbered from `frame` on. */
@@ -173,9 +208,19 @@ static void begin_segment(upb_stream *stream, uint64_t frame) {
     stream->oldest = 0;
     stream->next.frame = frame;
     stream->pending = 0;
-    stream->left = &stream->empty;
+    stream->left = empty_column(stream);
     if (stream->ring)
         memset(stream->ring, 0, ring_bytes(&stream->beams));
+}
+
+static void choose_kernels(upb_stream *s, const upb_stream_config *config) {
+    upb_kernels kernels;
+    s->stats.cpu = upb_kernels_select(&kernels, (upb_cpu)config->cpu);
+    s->prepare_f32 = kernels.prepare_f32;
+    s->windows_f32 = kernels.windows_f32;
+    s->prepare_int = kernels.prepare_int;
+    s->windows_int = config->precision == UPB_PRECISION_INT16 ? kernels.windows_int16 : kernels.windows_int8;
+    s->integer = config->precision == UPB_PRECISION_FP32 ? NULL : upb_model_integer(s->model, config->precision);
 }
 
 upb_status upb_stream_init(void *memory, size_t memory_bytes, const upb_model *model, const upb_stream_config *config,
@@ -190,7 +235,7 @@ upb_status upb_stream_init(void *memory, size_t memory_bytes, const upb_model *m
     if (status != UPB_OK)
         return status;
     upb_stream *s = memory;
-    memset(s, 0, sizeof *s);
+    memset(s, 0, bytes);
     s->model = model;
     s->sink = config->sink;
     s->user = config->user;
@@ -199,8 +244,11 @@ upb_status upb_stream_init(void *memory, size_t memory_bytes, const upb_model *m
     if (s->reorder_columns > s->columns / 2)
         s->reorder_columns = s->columns / 2;
     s->beams = plan_destagger(&model->info, config);
-    s->ring = s->beams.slots > 1 ? (ring_slot *)(void *)(s + 1) : NULL;
-    s->stats.cpu = upb_kernels_select(&s->kernels, (upb_cpu)config->cpu);
+    s->prepared = (unsigned char *)(s + 1);
+    s->prepared_bytes = prepared_bytes(config->precision);
+    s->ring = s->beams.slots > 1 ? (ring_slot *)(void *)(s->prepared + PREPARED_COLUMNS * s->prepared_bytes) : NULL;
+    choose_kernels(s, config);
+    s->stats.precision = config->precision;
     s->stats.delay_columns = s->beams.delay + 1;
     s->stats.state_bytes = (uint32_t)bytes;
     begin_segment(s, 0);
@@ -215,6 +263,7 @@ upb_status upb_stream_reset(upb_stream *stream) {
     memset(&stream->stats, 0, sizeof stream->stats);
     stream->stats.delay_columns = old.delay_columns;
     stream->stats.cpu = old.cpu;
+    stream->stats.precision = old.precision;
     stream->stats.state_bytes = old.state_bytes;
     begin_segment(stream, 0);
     return UPB_OK;
@@ -229,11 +278,25 @@ upb_status upb_stream_get_stats(const upb_stream *stream, upb_stream_stats *stat
 
 /* -------------------------------------------------------------------------------------- azimuth columns */
 
+static void prepare(const upb_stream *s, void *prepared, const uint16_t *distance, const uint8_t *intensity) {
+    if (s->integer)
+        s->prepare_int(prepared, s->integer, distance, intensity);
+    else
+        s->prepare_f32(prepared, &s->model->f32, distance, intensity);
+}
+
+static void make_windows(const upb_stream *s, const void *right, uint16_t *distance, uint8_t *intensity) {
+    if (s->integer)
+        s->windows_int(s->integer, s->left, s->middle, right, distance, intensity);
+    else
+        s->windows_f32(&s->model->f32, s->left, s->middle, right, distance, intensity);
+}
+
 /* Finishes the pending column between its neighbours and hands it out. */
-static void finish(upb_stream *s, const upb_prepared_f32 *right) {
+static void finish(upb_stream *s, const void *right) {
     uint16_t distance[UPB_LANES];
     uint8_t intensity[UPB_LANES];
-    s->kernels.windows_f32(&s->model->f32, s->left, s->middle, right, distance, intensity);
+    make_windows(s, right, distance, intensity);
     for (unsigned k = 0; k < UPB_WINDOWS; k++) {
         s->out_distance[2 * k + 1] = distance[k];
         s->out_intensity[2 * k + 1] = intensity[k];
@@ -252,8 +315,8 @@ static void finish(upb_stream *s, const upb_prepared_f32 *right) {
 }
 
 /* Makes the column just prepared the pending one. Its own rows leave as they came. */
-static void keep_pending(upb_stream *s, const upb_prepared_f32 *prepared, const uint16_t *distance,
-                         const uint8_t *intensity, int complete) {
+static void keep_pending(upb_stream *s, const void *prepared, const uint16_t *distance, const uint8_t *intensity,
+                         int complete) {
     for (unsigned k = 0; k < UPB_BEAMS; k++) {
         s->out_distance[2 * k] = distance[k];
         s->out_intensity[2 * k] = intensity[k];
@@ -267,9 +330,9 @@ static void keep_pending(upb_stream *s, const upb_prepared_f32 *prepared, const 
 
 /* Takes the next azimuth column of the segment. */
 static void take_azimuth_column(upb_stream *s, const uint16_t *distance, const uint8_t *intensity, int complete) {
-    upb_prepared_f32 *prepared = &s->prepared[s->spare];
-    s->spare = s->spare == 2 ? 0 : s->spare + 1;
-    s->kernels.prepare_f32(prepared, &s->model->f32, distance, intensity);
+    void *prepared = s->prepared + s->spare * s->prepared_bytes;
+    s->spare = s->spare + 1 == EMPTY_COLUMN ? 0 : s->spare + 1;
+    prepare(s, prepared, distance, intensity);
     if (s->pending) {
         finish(s, prepared);
         s->left = s->middle;
@@ -280,8 +343,8 @@ static void take_azimuth_column(upb_stream *s, const uint16_t *distance, const u
         s->next.column = 0;
         s->next.frame++;
         if (s->model->info.edge == UPB_EDGE_ZERO) {
-            finish(s, &s->empty);
-            s->left = &s->empty;
+            finish(s, empty_column(s));
+            s->left = empty_column(s);
         }
     }
 }
@@ -373,7 +436,7 @@ upb_status upb_stream_flush(upb_stream *stream) {
     for (uint32_t i = 0; i < stream->beams.delay; i++)
         complete_slot(stream);
     if (stream->pending)
-        finish(stream, &stream->empty);
+        finish(stream, empty_column(stream));
     begin_segment(stream, stream->next.column == 0 ? stream->next.frame : stream->next.frame + 1);
     return UPB_OK;
 }

@@ -43,7 +43,7 @@ extern "C" {
 #endif
 
 /* Raised when a caller must be recompiled. upb_api_version() tells what the library was built with. */
-#define UPB_API_VERSION 0u
+#define UPB_API_VERSION 1u
 
 #define UPB_BEAMS 32u      /* beams of an input column */
 #define UPB_ROWS 64u       /* rows of an output column */
@@ -65,9 +65,10 @@ typedef enum upb_status {
     UPB_E_SECTION = 8,    /* a required section is unknown (error.what: its tag), missing, or lies outside the file */
     UPB_E_VALUE = 9,      /* a value in the model file is impossible: error.what names it */
     UPB_E_SENSOR = 10,    /* the stream's sensor is not the one the model was made for */
-    UPB_E_PRECISION = 11, /* precision not in the model, or not in this build */
+    UPB_E_PRECISION = 11, /* the model file does not have the precision */
     UPB_E_CPU = 12,       /* an instruction set was asked for that this machine, or this build, does not have */
-    UPB_E_ORDER = 13      /* a column older than one already taken: dropped and counted */
+    UPB_E_ORDER = 13,     /* a column older than one already taken: dropped and counted */
+    UPB_E_SIGNATURE = 14  /* the caller's verify function refused the model file */
 } upb_status;
 
 /* One lower-case English sentence without full stop, static, never null. */
@@ -105,6 +106,14 @@ typedef enum upb_empty_rule {
     UPB_EMPTY_FILL = 1  /* an empty pixel takes the opposite row's value, an empty column its neighbours' (docs) */
 } upb_empty_rule;
 
+/*
+ * What a stream computes with. Float is in every model file; the integer precisions (docs/numeric-contract.md: the same
+ * bits on every machine) are in those that were quantised: upb_model_info.precisions.
+ */
+typedef enum upb_precision { UPB_PRECISION_FP32 = 0, UPB_PRECISION_INT16 = 1, UPB_PRECISION_INT8 = 2 } upb_precision;
+
+#define UPB_PRECISIONS 3u
+
 typedef struct upb_model_info {
     char sensor[32];           /* name of the beam table, zero terminated */
     uint32_t columns;          /* per turn */
@@ -115,8 +124,12 @@ typedef struct upb_model_info {
     uint32_t edge;                          /* upb_edge */
     uint32_t last_row;                      /* upb_last_row */
     uint32_t empty_rule;                    /* upb_empty_rule */
-    uint32_t hidden[2];                     /* hidden units: distance network, intensity network */
+    uint32_t hidden[2];                     /* hidden units of the float networks: distance, intensity */
     uint32_t crc32;                         /* of the model file: its identity */
+    uint32_t file_bytes;                    /* of the model file, all sections */
+    uint32_t signature_bytes;               /* of its signature, 0: none. Says nothing of who looked at it */
+    uint32_t precisions;                    /* bit 1 << upb_precision: the file has it */
+    uint32_t weight_bytes[UPB_PRECISIONS];  /* of both networks as the file holds them; 0: not in the file */
     int32_t row_elevation_udeg[UPB_ROWS];   /* millionths of a degree above the horizon */
     int32_t azimuth_offset_udeg[UPB_BEAMS]; /* clockwise from the firing's azimuth to the beam's */
     int32_t row_height_um[UPB_ROWS];        /* height of the row's laser origin over the sensor's, micrometres */
@@ -134,20 +147,38 @@ UPB_API size_t upb_model_bytes(void);
 UPB_API upb_status upb_model_load(void *memory, size_t memory_bytes, const void *ubm, size_t ubm_bytes,
                                   upb_model **model, upb_error *error);
 
+/*
+ * Looks at a model file's signature: not 0 if it is good. `data` are the bytes it is for, from the file's first to the
+ * signature section; `signature` is that section's content, at most UPB_SIGNATURE_BYTES_MAX. A file without one comes
+ * with its bytes before the checksum, and signature_bytes 0. Neither pointer is null; both are valid during the call.
+ */
+typedef int (*upb_verify_fn)(void *user, const void *data, size_t data_bytes, const void *signature,
+                             size_t signature_bytes);
+
+#define UPB_SIGNATURE_BYTES_MAX 4096u
+
+/*
+ * upb_model_load for a caller that takes signed models only: `verify` is asked once, when length, checksum and section
+ * table have been checked and before anything else of the file is read. The library has no cryptography of its own. A
+ * null `verify` asks nobody. Errors: those of upb_model_load, SIGNATURE.
+ */
+UPB_API upb_status upb_model_load_verified(void *memory, size_t memory_bytes, const void *ubm, size_t ubm_bytes,
+                                           upb_verify_fn verify, void *user, upb_model **model, upb_error *error);
+
 UPB_API upb_status upb_model_get_info(const upb_model *model, upb_model_info *info);
 
 /* ------------------------------------------------------------------------------------------------ stream */
 
 typedef struct upb_stream upb_stream;
 
-typedef enum upb_precision { UPB_PRECISION_FP32 = 0, UPB_PRECISION_INT16 = 1, UPB_PRECISION_INT8 = 2 } upb_precision;
-
 typedef enum upb_cpu {
     UPB_CPU_AUTO = 0, /* the fastest this machine has */
     UPB_CPU_SCALAR = 1,
-    UPB_CPU_AVX2 = 2,   /* AVX2 and FMA */
-    UPB_CPU_AVX512 = 3, /* AVX-512 F, BW, DQ, VL */
-    UPB_CPU_NEON = 4    /* AArch64 */
+    UPB_CPU_AVX2 = 2,        /* AVX2 and FMA */
+    UPB_CPU_AVX512 = 3,      /* AVX-512 F, BW, DQ, VL */
+    UPB_CPU_NEON = 4,        /* AArch64 */
+    UPB_CPU_AVX512_VNNI = 5, /* UPB_CPU_AVX512 and VNNI */
+    UPB_CPU_NEON_DOT = 6     /* AArch64 with the dot product instructions */
 } upb_cpu;
 
 /*
@@ -202,16 +233,31 @@ typedef struct upb_stream_stats {
                              the right neighbour. The last column of a turn under UPB_EDGE_ZERO is one push earlier */
     uint32_t cpu;         /* upb_cpu in use */
     uint32_t state_bytes; /* of the stream's memory that is read or written */
-    uint32_t reserved;
+    uint32_t precision;   /* upb_precision in use */
 } upb_stream_stats;
 
 /* Bytes of memory a stream of this model and configuration needs; the same checks as upb_stream_init. */
 UPB_API upb_status upb_stream_bytes(const upb_model *model, const upb_stream_config *config, size_t *bytes,
                                     upb_error *error);
 
+/* What a model and a stream take, in bytes. */
+typedef struct upb_sizes {
+    uint32_t file;    /* the model file, all sections and precisions */
+    uint32_t weights; /* both networks of the precision as the file holds them */
+    uint32_t tables;  /* the same in memory as the kernels read them, padded, with the limits of 32 beams */
+    uint32_t state;   /* the stream: upb_stream_bytes */
+    uint32_t ring;    /* of it, the destagger ring; 0 where no beam is offset, and for aligned columns */
+    uint32_t reserved[3];
+} upb_sizes;
+
+/* The sizes for config->precision; the same checks as upb_stream_init. */
+UPB_API upb_status upb_stream_sizes(const upb_model *model, const upb_stream_config *config, upb_sizes *sizes,
+                                    upb_error *error);
+
 /*
  * Makes a stream in `memory` (UPB_ALIGN-aligned, at least upb_stream_bytes()). The model must outlive it.
- * Errors: ARGUMENT, SIZE, ALIGN, SENSOR, PRECISION, CPU.
+ * Errors: ARGUMENT, SIZE, ALIGN, SENSOR, CPU; PRECISION: not in the model file (got: the upb_precision asked for,
+ * expected: upb_model_info.precisions, the mask of those that are there).
  */
 UPB_API upb_status upb_stream_init(void *memory, size_t memory_bytes, const upb_model *model,
                                    const upb_stream_config *config, upb_stream **stream, upb_error *error);

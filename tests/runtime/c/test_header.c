@@ -13,10 +13,10 @@ int main(void) {
     CHECK_EQUAL(config.struct_bytes, sizeof config);
     CHECK(upb_model_bytes() <= UPB_MODEL_BYTES_MAX);
     CHECK(!upb_row_is_generated(0) && upb_row_is_generated(63));
-    for (int status = UPB_OK; status <= UPB_E_ORDER; status++)
+    for (int status = UPB_OK; status <= UPB_E_SIGNATURE; status++)
         CHECK(strlen(upb_status_text((upb_status)status)) > 5 &&
               strcmp(upb_status_text((upb_status)status), "unknown status"));
-    CHECK(strcmp(upb_status_text((upb_status)(UPB_E_ORDER + 1)), "unknown status") == 0);
+    CHECK(strcmp(upb_status_text((upb_status)(UPB_E_SIGNATURE + 1)), "unknown status") == 0);
     CHECK(strcmp(upb_status_text((upb_status)-1), "unknown status") == 0);
     return check_report("header (C)");
 }

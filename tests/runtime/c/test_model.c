@@ -7,6 +7,7 @@
 #include "check.h"
 #include "ubm_writer.h"
 #include "upb_internal.h"
+#include "upb_network_int.h"
 
 static _Alignas(UPB_ALIGN) unsigned char memory[UPB_MODEL_BYTES_MAX];
 
@@ -76,6 +77,11 @@ static void test_info(random_source *random) {
     CHECK_EQUAL(info.hidden[0], 7);
     CHECK_EQUAL(info.hidden[1], 3);
     CHECK_EQUAL(info.crc32, plain_crc32(file, size - 4));
+    CHECK_EQUAL(info.file_bytes, size);
+    CHECK_EQUAL(info.precisions, 1u << UPB_PRECISION_FP32);
+    CHECK_EQUAL(info.weight_bytes[UPB_PRECISION_FP32], 4 * (2 * (4 + 1) + (7 + 3) * 9));
+    CHECK(info.weight_bytes[UPB_PRECISION_INT16] == 0 && info.weight_bytes[UPB_PRECISION_INT8] == 0);
+    CHECK_EQUAL(info.signature_bytes, 0);
     CHECK(memcmp(info.row_elevation_udeg, m.elevation, sizeof m.elevation) == 0);
     CHECK(memcmp(info.azimuth_offset_udeg, m.offset, sizeof m.offset) == 0);
     CHECK(memcmp(info.row_height_um, m.height, sizeof m.height) == 0);
@@ -108,6 +114,52 @@ static void test_folding(random_source *random) {
         }
         CHECK(to->skip == from->skip && to->slope == from->slope && to->positive == from->flags);
         CHECK(fabs((double)to->offset * unit - (double)from->c) <= 1e-6);
+    }
+}
+
+/* What the kernels are given is the file's network, finished. */
+static void compare_integer(const test_integer *from, const upb_network_int *loaded, upb_precision precision) {
+    upb_network_int net;
+    memset(&net, 0, sizeof net);
+    net.hidden = from->hidden;
+    net.skip = from->skip;
+    net.slope = (int32_t)from->slope;
+    net.k = from->k, net.j = from->j, net.t = from->t;
+    net.offset = from->c;
+    for (uint32_t h = 0; h < from->hidden; h++) {
+        net.bias[h] = from->b[h];
+        net.output[h] = from->v[h];
+        memcpy(net.weight[h], from->w[h], sizeof from->w[h]);
+        net.weight[h][UPB_TAP_MINIMUM] = from->m[h];
+    }
+    upb_network_int_finish(&net, precision);
+    CHECK(memcmp(&net, loaded, sizeof net) == 0);
+}
+
+static void test_integers(random_source *random) {
+    static uint8_t file[UBM_MAX];
+    for (uint32_t hidden = 1; hidden <= UPB_MAX_HIDDEN; hidden++) {
+        test_model m = random_model(random, 1024, 12);
+        add_integers(random, &m, hidden);
+        m.integer[UPB_PRECISION_INT8][1].hidden = 1;
+        const size_t size = write_ubm(file, &m, NULL, 0);
+        const uint32_t narrow = 28 + 13 * hidden;
+        upb_model *model;
+        upb_error error;
+        if (!CHECK_EQUAL(load(file, size, &model, &error), UPB_OK))
+            return;
+        for (int p = 0; p < 2; p++)
+            for (int n = 0; n < 2; n++)
+                compare_integer(&m.integer[p + 1][n], &model->integer[p].network[n], (upb_precision)(p + 1));
+        CHECK_EQUAL(model->info.precisions, 7);
+        CHECK_EQUAL(model->info.weight_bytes[UPB_PRECISION_INT16], 2 * (28 + 20 * hidden));
+        CHECK_EQUAL(model->info.weight_bytes[UPB_PRECISION_INT8], (narrow + 3) / 4 * 4 + 44);
+        CHECK(memcmp(model->integer[0].seen_max, model->integer[1].seen_max, sizeof model->integer[0].seen_max) == 0);
+        for (unsigned k = 0; k < UPB_LANES; k++) {
+            CHECK_EQUAL(model->integer[0].seen_max[k], m.row_max[2 * k]);
+            CHECK_EQUAL(model->integer[0].given_max[k], m.row_max[2 * k + 1]);
+        }
+        CHECK(model->integer[1].min_count == 1500 && model->integer[1].fill == 1);
     }
 }
 
@@ -165,6 +217,13 @@ static void check_invariants(const upb_model *model) {
                 bounded &= fabsf(net->unit[h][i]) <= 1e11f; /* false for NaN */
         CHECK(bounded);
     }
+    for (uint32_t p = UPB_PRECISION_INT16; p <= UPB_PRECISION_INT8; p++)
+        for (int n = 0; n < 2 && upb_model_has(model, p); n++) {
+            const upb_network_int *net = &upb_model_integer(model, p)->network[n];
+            CHECK(net->hidden >= 2 && net->hidden <= UPB_MAX_HIDDEN && net->hidden % 2 == 0);
+            CHECK(net->k <= 16 && net->j <= 16 && net->t <= 24 && net->skip <= 1);
+            CHECK(net->slope >= 0 && net->slope <= 32767);
+        }
     CHECK(model->info.columns >= 4 && model->info.columns <= UPB_MAX_COLUMNS);
     CHECK(model->info.min_count >= 1 && model->info.min_count <= model->info.max_count);
     CHECK(model->info.max_count <= 65535 && memchr(model->info.sensor, 0, 32) != NULL);
@@ -237,6 +296,8 @@ static void test_sections(const test_model *m) {
     expect_error(file, write_ubm(file, m, &bad_tag, 1), UPB_E_VALUE, "tag");
     expect_error(file, write_ubm(file, m, twice, 2), UPB_E_SECTION, "PROV");
     expect_error(file, write_ubm(file, m, many, 31), UPB_E_VALUE, "sections");
+    const test_section early = {"SIGN", 0, 5, 1};
+    expect_error(file, write_ubm(file, m, &early, 1), UPB_E_SECTION, "SIGN");
     for (int missing = 0; missing < 2; missing++) {
         const size_t size = write_ubm(file, m, NULL, 0);
         put_u32(file + 32 + 16 * missing + 4, 0);
@@ -261,7 +322,8 @@ enum { SENS = 64, NETW = SENS + 832, NETW_1 = NETW + 4 + 16 + 12 * 36 + 4 };
 
 static const wrong_field wrong_fields[] = {
     {0, 4, 0x4d425056, UPB_E_MAGIC, "magic"},
-    {4, 2, 1, UPB_E_VERSION, "version"},
+    {4, 2, 0, UPB_E_VERSION, "version"},
+    {4, 2, 2, UPB_E_VERSION, "version"},
     {6, 2, 33, UPB_E_VALUE, "header_bytes"},
     {8, 4, 2000000, UPB_E_VALUE, "file_bytes"},
     {12, 4, 0, UPB_E_VALUE, "sections"},
@@ -316,34 +378,226 @@ static const wrong_field wrong_fields[] = {
     {NETW_1 - 4, 4, 0x50000000, UPB_E_VALUE, "NETW[0].c"},
 };
 
-static void test_wrong_fields(const uint8_t *file, size_t size) {
+/* `at` counts from `start`. */
+static void check_wrong_fields(const uint8_t *file, size_t size, size_t start, const wrong_field *fields,
+                               size_t count) {
     static uint8_t changed[UBM_MAX];
-    for (size_t i = 0; i < sizeof wrong_fields / sizeof wrong_fields[0]; i++) {
-        const wrong_field *field = &wrong_fields[i];
+    for (size_t i = 0; i < count; i++) {
+        const wrong_field *field = &fields[i];
         memcpy(changed, file, size);
         for (int byte = 0; byte < field->bytes; byte++)
-            changed[field->at + byte] = (uint8_t)(field->value >> 8 * byte);
+            changed[start + (size_t)field->at + (size_t)byte] = (uint8_t)(field->value >> 8 * byte);
         seal(changed, size);
         expect_error(changed, size, field->status, field->what);
     }
+}
+
+static void test_wrong_fields(const test_model *m) {
+    static uint8_t file[UBM_MAX];
+    const size_t size = write_ubm(file, m, NULL, 0);
+    check_wrong_fields(file, size, 0, wrong_fields, sizeof wrong_fields / sizeof wrong_fields[0]);
+}
+
+/* ------------------------------------------------------------------------------------- integer sections */
+
+enum { Q_HEAD = 36, Q16_1 = Q_HEAD + 28 + 7 * 20, Q8_1 = Q_HEAD + 120 };
+
+/* Seven hidden units: an int8 network has 119 bytes and one of padding. */
+static const wrong_field wrong_16[] = {
+    {0, 1, 'v', UPB_E_VALUE, "Q16.contract"},
+    {14, 1, '2', UPB_E_VALUE, "Q16.contract"},
+    {15, 1, '1', UPB_E_VALUE, "Q16.contract"},
+    {31, 1, 1, UPB_E_VALUE, "Q16.contract"},
+    {32, 4, 1, UPB_E_VALUE, "Q16.count"},
+    {Q_HEAD, 4, 0, UPB_E_VALUE, "Q16.distance.hidden"},
+    {Q_HEAD, 4, 33, UPB_E_VALUE, "Q16.distance.hidden"},
+    {Q16_1, 4, 33, UPB_E_VALUE, "Q16.intensity.hidden"},
+    {Q16_1, 4, 8, UPB_E_VALUE, "Q16.intensity.bytes"}, /* too short */
+    {Q_HEAD + 4, 4, 2, UPB_E_VALUE, "Q16.distance.skip"},
+    {Q_HEAD + 8, 4, 32768, UPB_E_VALUE, "Q16.distance.slope"},
+    {Q_HEAD + 12, 4, 1, UPB_E_VALUE, "Q16.distance.k"}, /* 40000 << 1 */
+    {Q_HEAD + 16, 4, 1, UPB_E_VALUE, "Q16.distance.j"},
+    {Q_HEAD + 20, 4, 25, UPB_E_VALUE, "Q16.distance.t"},
+    {Q16_1 + 12, 4, 9, UPB_E_VALUE, "Q16.intensity.k"}, /* 255 << 9 */
+    {Q16_1 + 16, 4, 9, UPB_E_VALUE, "Q16.intensity.j"},
+    {Q_HEAD + 28 + 5 * 4, 4, 0x7fffffff, UPB_E_VALUE, "Q16.distance.S[5]"},
+    {Q16_1 + 28 + 6 * 4, 4, 0x80000000, UPB_E_VALUE, "Q16.intensity.S[6]"},
+    {Q_HEAD + 24, 4, 0x7fffffff, UPB_E_VALUE, "Q16.distance.Y"},
+    {Q16_1 + 24, 4, 0x80000000, UPB_E_VALUE, "Q16.intensity.Y"},
+};
+
+static const wrong_field wrong_8[] = {
+    {10, 1, '1', UPB_E_VALUE, "Q8.contract"},
+    {32, 4, 3, UPB_E_VALUE, "Q8.count"},
+    {Q_HEAD + 119, 1, 1, UPB_E_VALUE, "Q8.distance.padding"},
+    {Q8_1 + 119, 1, 0x80, UPB_E_VALUE, "Q8.intensity.padding"},
+    {Q8_1 + 12, 4, 17, UPB_E_VALUE, "Q8.intensity.k"},
+    {Q_HEAD + 12, 4, 9, UPB_E_VALUE, "Q8.distance.k"}, /* 40000 << (9 - 8) */
+    {Q8_1 + 16, 4, 9, UPB_E_VALUE, "Q8.intensity.j"},
+    {Q8_1, 4, 8, UPB_E_VALUE, "Q8.intensity.bytes"},
+    {Q8_1 + 28, 4, 0x7fffffff, UPB_E_VALUE, "Q8.intensity.S[0]"},
+    {Q_HEAD + 24, 4, 0x80000000, UPB_E_VALUE, "Q8.distance.Y"},
+};
+
+/* Where a section begins; `*entry` is its place in the table. */
+static size_t find_section(const uint8_t *file, const char *tag, size_t *entry) {
+    for (*entry = 32; memcmp(file + *entry, tag, 4) != 0; *entry += 16)
+        if (!CHECK(*entry < 512))
+            exit(2);
+    return file[*entry + 8] | (size_t)file[*entry + 9] << 8;
+}
+
+static void test_wrong_integers(random_source *random) {
+    static uint8_t file[UBM_MAX];
+    test_model m = random_model(random, 1024, 12);
+    size_t entry;
+    add_integers(random, &m, 7);
+    for (int p = 1; p <= 2; p++)
+        for (int n = 0; n < 2; n++) /* a minimum that the sums of wrong biases cannot cancel */
+            for (int h = 0; h < 7; h++)
+                m.integer[p][n].m[h] = 1, m.integer[p][n].w[h][0] = -1;
+    const size_t size = write_ubm(file, &m, NULL, 0);
+    expect_error(file, size, UPB_OK, "");
+    check_wrong_fields(file, size, find_section(file, "Q16 ", &entry), wrong_16, sizeof wrong_16 / sizeof wrong_16[0]);
+    const wrong_field short_16 = {12, 4, 35, UPB_E_VALUE, "gap"}; /* what is left over is not 0 */
+    check_wrong_fields(file, size, entry, &short_16, 1);
+    check_wrong_fields(file, size, find_section(file, "Q8  ", &entry), wrong_8, sizeof wrong_8 / sizeof wrong_8[0]);
+    const wrong_field longer = {12, 4, Q_HEAD + 2 * 120 + 4, UPB_E_VALUE, "Q8.intensity.bytes"};
+    check_wrong_fields(file, size, entry, &longer, 1); /* as far as the gap behind it */
+    const test_section empty = {"Q8  ", 0, 35, 0}, zeros = {"Q8  ", 0, 60, 0};
+    m.precisions = 0;
+    expect_error(file, write_ubm(file, &m, &empty, 1), UPB_E_VALUE, "Q8.bytes");
+    expect_error(file, write_ubm(file, &m, &zeros, 1), UPB_E_VALUE, "Q8.contract");
+}
+
+/* One unit whose sum, or output, stands at the bound of the proof, and one beyond. */
+static void expect_bound(test_model *m, upb_precision precision, int32_t *value, int32_t good, int step,
+                         const char *what) {
+    static uint8_t file[UBM_MAX];
+    char name[32];
+    const int32_t old = *value;
+    m->precisions = 1u << precision;
+    *value = good;
+    expect_error(file, write_ubm(file, m, NULL, 0), UPB_OK, "");
+    *value = good + step;
+    snprintf(name, sizeof name, "%s.distance.%s", precision == UPB_PRECISION_INT8 ? "Q8" : "Q16", what);
+    expect_error(file, write_ubm(file, m, NULL, 0), UPB_E_VALUE, name);
+    *value = old;
+}
+
+static void test_bounds(random_source *random) {
+    test_model m = random_model(random, 1024, 12); /* counts 1500 to 40000 */
+    test_integer *net[UPB_PRECISIONS] = {NULL, &m.integer[UPB_PRECISION_INT16][0], &m.integer[UPB_PRECISION_INT8][0]};
+    add_integers(random, &m, 2);
+    for (upb_precision p = UPB_PRECISION_INT16; p <= UPB_PRECISION_INT8; p = (upb_precision)(p + 1)) {
+        const int32_t top = INT32_MAX - 32768, most_filled = p == UPB_PRECISION_INT8 ? 38500 + 128 : 38500,
+                      most = p == UPB_PRECISION_INT8 ? 40000 + 128 : 40000;
+        memset(net[p], 0, sizeof *net[p]);
+        net[p]->hidden = 2;
+        net[p]->t = 3;
+        expect_bound(&m, p, &net[p]->b[1], top, 1, "S[1]");
+        m.empty_rule = UPB_EMPTY_FILL;
+        net[p]->w[1][4] = 100;
+        expect_bound(&m, p, &net[p]->b[1], top - 100 * most_filled, 1, "S[1]");
+        m.empty_rule = UPB_EMPTY_NONE;
+        expect_bound(&m, p, &net[p]->b[1], top - 100 * most, 1, "S[1]");
+        net[p]->m[1] = -100; /* the minimum and the differences at their worst, independently */
+        expect_bound(&m, p, &net[p]->b[1], INT32_MIN + 100 * 40000, -1, "S[1]");
+        expect_bound(&m, p, &net[p]->b[1], top - 100 * most, 1, "S[1]");
+        net[p]->w[1][4] = net[p]->m[1] = 0;
+        expect_bound(&m, p, &net[p]->c, (1 << 30) - 1 - 4, 1, "Y");
+        expect_bound(&m, p, &net[p]->c, -(1 << 30), -1, "Y");
+        net[p]->b[0] = 1000 << 16;
+        net[p]->v[0] = 100;
+        expect_bound(&m, p, &net[p]->c, (1 << 30) - 1 - 4 - 100000, 1, "Y");
+        net[p]->v[0] = -100;
+        expect_bound(&m, p, &net[p]->c, 100000 - (1 << 30), -1, "Y");
+        net[p]->b[0] = -(1000 << 16); /* half of it by the slope */
+        net[p]->slope = 16384;
+        expect_bound(&m, p, &net[p]->c, (1 << 30) - 1 - 4 - 50000, 1, "Y");
+        m.empty_rule = UPB_EMPTY_FILL;
+    }
+}
+
+/* ------------------------------------------------------------------------------------------- signatures */
+
+typedef struct verifier {
+    const uint8_t *file;
+    size_t data_bytes, signature_bytes;
+    int answer, calls;
+} verifier;
+
+static int verify(void *user, const void *data, size_t data_bytes, const void *signature, size_t signature_bytes) {
+    verifier *v = user;
+    v->calls++;
+    CHECK(data == v->file && signature == v->file + data_bytes);
+    CHECK_EQUAL(data_bytes, v->data_bytes);
+    CHECK_EQUAL(signature_bytes, v->signature_bytes);
+    for (size_t i = 0; i < signature_bytes; i++)
+        CHECK_EQUAL(((const uint8_t *)signature)[i], 0x5a);
+    return v->answer;
+}
+
+static void test_signature(random_source *random, uint32_t signed_with) {
+    static uint8_t file[UBM_MAX];
+    test_model m = random_model(random, 1024, 12);
+    size_t entry;
+    upb_model *model;
+    upb_error error;
+    add_integers(random, &m, 12);
+    m.signed_with = signed_with;
+    const size_t size = write_ubm(file, &m, NULL, 0);
+    verifier v = {file, signed_with ? find_section(file, "SIGN", &entry) : size - 4, signed_with ? signed_with - 1 : 0,
+                  1, 0};
+    CHECK_EQUAL(upb_model_load_verified(memory, sizeof memory, file, size, verify, &v, &model, &error), UPB_OK);
+    CHECK(model != NULL && v.calls == 1);
+    CHECK_EQUAL(model->info.signature_bytes, v.signature_bytes);
+    v.answer = 0;
+    CHECK_EQUAL(upb_model_load_verified(memory, sizeof memory, file, size, verify, &v, &model, &error),
+                UPB_E_SIGNATURE);
+    CHECK(model == NULL && v.calls == 2 && strcmp(error.what, "SIGN") == 0);
+    CHECK_EQUAL(error.got, v.signature_bytes);
+    CHECK_EQUAL(upb_model_load_verified(memory, sizeof memory, file, size, NULL, &v, &model, &error), UPB_OK);
+    CHECK_EQUAL(load(file, size, &model, &error), UPB_OK); /* nobody is asked */
+    file[size - 1] ^= 1;                                   /* a damaged file is not shown to the verifier */
+    CHECK_EQUAL(upb_model_load_verified(memory, sizeof memory, file, size, verify, &v, &model, &error), UPB_E_CRC);
+    CHECK_EQUAL(v.calls, 2);
+}
+
+static void test_signatures(random_source *random) {
+    static uint8_t file[UBM_MAX];
+    test_model m = random_model(random, 1024, 12);
+    test_signature(random, 0);
+    test_signature(random, 1); /* an empty one */
+    test_signature(random, 1 + 64);
+    test_signature(random, 1 + UPB_SIGNATURE_BYTES_MAX);
+    m.signed_with = 1 + UPB_SIGNATURE_BYTES_MAX + 1;
+    expect_error(file, write_ubm(file, &m, NULL, 0), UPB_E_VALUE, "SIGN.bytes");
 }
 
 int main(int argc, char **argv) {
     static uint8_t file[UBM_MAX];
     const unsigned long seed = option_number(argc, argv, "--seed", 1);
     random_source random = random_seeded(seed);
-    const test_model m = random_model(&random, 2048, 12);
+    const test_model plain = random_model(&random, 2048, 12);
+    test_model m = plain;
+    add_integers(&random, &m, 5);
+    m.signed_with = 1 + 20;
     const size_t size = write_ubm(file, &m, NULL, 0);
     printf("test_model --seed %lu\n", seed);
     test_offsets(&random);
     test_info(&random);
     test_folding(&random);
+    test_integers(&random);
     test_memory(&random);
     test_truncation(file, size);
     test_flipped_bits(file, size);
     test_every_byte(file, size);
-    test_sections(&m);
-    test_wrong_fields(file, size);
+    test_sections(&plain);
+    test_wrong_fields(&plain);
+    test_wrong_integers(&random);
+    test_bounds(&random);
+    test_signatures(&random);
     test_mutations(&random, file, size, option_number(argc, argv, "--count", 20000));
     return check_report("model");
 }
