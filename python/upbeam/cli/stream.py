@@ -15,7 +15,7 @@ from upbeam.model.frames import image_of_cloud, kitti_files
 from upbeam.model.io import read_cloud
 from upbeam.model.rules import BEAMS, ROWS
 from upbeam.runtime.live import LiveConfig, LiveProgress, LiveResult, firing_columns, run_live
-from upbeam.runtime.upsampler import Model, load_model
+from upbeam.runtime.upsampler import CPUS, PRECISIONS, Model, load_model
 
 from .common import JsonOption, UserError, emit_json, message, progress_bar, show, table
 from .sources import simulated_scans
@@ -51,8 +51,8 @@ def stream(
     ] = None,
     model: Annotated[str | None, typer.Option(help="A .ubm file, or hdl-32e or vlp-32c instead of hdl-64e.")] = None,
     backend: Annotated[str, typer.Option(help="cpu.")] = "cpu",
-    precision: Annotated[str, typer.Option(help="fp32.")] = "fp32",
-    cpu: Annotated[str, typer.Option(help="Force an instruction set: scalar, avx2, avx512, neon.")] = "auto",
+    precision: Annotated[str, typer.Option(help=", ".join(PRECISIONS) + ".")] = "fp32",
+    cpu: Annotated[str, typer.Option(help=f"Force an instruction set: {', '.join(CPUS[1:])}.")] = "auto",
     deadline_ms: Annotated[float, typer.Option(help="From the last input column to the last output column.")] = 50.0,
     clock: Annotated[str, typer.Option(help="real, or virtual (deterministic, modelled service time).")] = "real",
     column_us: Annotated[float, typer.Option(help="Virtual clock: service time of a column.")] = VIRTUAL_COLUMN_US,
@@ -70,14 +70,14 @@ def stream(
     as_json: JsonOption = False,
 ) -> None:
     """Play a 20 Hz feed packet by packet through the column stream and judge every frame."""
-    if backend != "cpu" or precision != "fp32":
-        raise UserError(f"--backend {backend} --precision {precision}: this version streams with cpu and fp32")
+    if backend != "cpu":
+        raise UserError(f"--backend {backend}: a stream runs on the cpu; whole images also on others (upsample)")
     if clock not in ("real", "virtual"):
         raise UserError(f"--clock {clock}: expected real or virtual")
     loaded = load_model(model)
     config = LiveConfig(
         rate_hz=rate, frames=frames, deadline_ms=deadline_ms, clock="real" if clock == "real" else "virtual", cpu=cpu,
-        any_sensor=any_sensor, service_column_us=column_us if clock == "virtual" else None,
+        precision=precision, any_sensor=any_sensor, service_column_us=column_us if clock == "virtual" else None,
     )  # fmt: skip
     feed = _feed(source, loaded, sensor, any_sensor, frames, rate, seed, quiet=as_json)
     result = _play(feed, loaded, config, quiet=as_json)
@@ -185,7 +185,7 @@ def _summary(feed: _Feed, model: Model, result: LiveResult) -> dict[str, Any]:
         "sensor": feed.sensor,
         "model_crc32": f"{model.crc32:08x}",
         "backend": "cpu",
-        "precision": "fp32",
+        "precision": result.precision,
         "kind": "measured" if result.clock == "real" else "modelled",
         "cpu_instruction_set": result.cpu,
         **result.to_dict(),

@@ -1,0 +1,193 @@
+"""Memories and parameters for RTL: what a core needs of a model, generated, nothing typed by hand.
+
+Per precision a folder: ``.mem`` files for ``$readmemh`` (two's complement, exact width, one value a line), a
+SystemVerilog header of local parameters, and beside the folders one manifest.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from upbeam.model.rules import Rules
+from upbeam.quant.integer import (
+    CODE_BITS,
+    CONTRACTS,
+    HIDDEN_SHIFT,
+    IntegerModel,
+    IntegerNetwork,
+    Precision,
+    largest_code,
+    largest_inputs,
+)
+from upbeam.quant.sizes import weight_bytes
+
+from .source import NETWORKS, ExportError, NetworkName, Source, new_folder
+
+__all__ = ["FORMAT", "MANIFEST", "PARAMETERS", "Memory", "memories", "parameters", "write_rtl"]
+
+FORMAT = "upbeam.rtl.v1"
+MANIFEST = "manifest.json"
+PARAMETERS = "upb_params.svh"
+SUM_BITS, HIDDEN_BITS, COUNT_BITS, INTENSITY_BITS = 32, 16, 16, 8
+
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Memory:
+    """One ``.mem`` file."""
+
+    file: str
+    what: str
+    bits: int
+    values: I64
+    """flat; address 0 first"""
+
+    def text(self, head: str) -> str:
+        digits = self.bits // 4
+        lines = [f"{int(value) & ((1 << self.bits) - 1):0{digits}x}" for value in self.values]
+        return "\n".join([f"// {head}", f"// {self.what}; {len(lines)} x {self.bits} bits", *lines, ""])
+
+
+def write_rtl(source: Source, folder: Path, precisions: Sequence[Precision] | None = None) -> dict[str, Any]:
+    """Writes ``FOLDER/manifest.json`` and ``FOLDER/PRECISION/...``; returns the manifest.
+
+    ``folder`` must be empty or new. Raises ExportError for that, for a precision the model does not have, and for a
+    model without any."""
+    wanted = list(source.precisions if precisions is None else precisions)
+    if not wanted:
+        raise ExportError(f"{source.name}: no integer networks in this model; upbeam quantize adds them")
+    texts = {precision: _texts(source, source.integer(precision)) for precision in wanted}
+    new_folder(folder)
+    for precision, files in texts.items():
+        (folder / precision).mkdir()
+        for name, text in files.items():
+            (folder / precision / name).write_text(text, encoding="ascii")
+    manifest = _manifest(source, texts)
+    (folder / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+    return manifest
+
+
+def _texts(source: Source, model: IntegerModel) -> dict[str, str]:
+    head = f"{source.name} {source.crc32:08x}, {model.contract}"
+    files = {PARAMETERS: parameters(source, model.precision)}
+    return files | {memory.file: memory.text(head) for memory in memories(model)}
+
+
+def _manifest(source: Source, texts: dict[Precision, dict[str, str]]) -> dict[str, Any]:
+    sizes = weight_bytes(source.data)
+    return {
+        "format": FORMAT,
+        "model": source.name,
+        "model_bytes": len(source.data),
+        "model_crc32": f"{source.crc32:08x}",
+        "provenance": source.file.provenance,
+        "precisions": {
+            precision: {
+                "contract": CONTRACTS[precision],
+                "weight_bytes": sizes[precision],
+                "files": {f"{precision}/{name}": len(text) for name, text in files.items()},
+            }
+            for precision, files in texts.items()
+        },
+    }
+
+
+# ----------------------------------------------------------------------------------------------------- memories
+
+
+def memories(model: IntegerModel) -> list[Memory]:
+    """W, M, B and V of both networks. W: address ``6 h + i``; the others: address ``h``."""
+    narrow = weight_bits(model.precision)
+    return [
+        Memory(f"{which}_{letter}.mem", f"{letter} of the {which} network: {what}", bits, values.reshape(-1))
+        for which, n in zip(NETWORKS, model, strict=True)
+        for letter, what, bits, values in (
+            ("W", "weights of the differences, address 6 h + i", narrow, n.weight),
+            ("M", "weights of the minimum, address h", 16, n.minimum),
+            ("B", "biases, address h", SUM_BITS, n.bias),
+            ("V", "output weights, address h", narrow, n.output),
+        )
+    ]
+
+
+def weight_bits(precision: Precision) -> int:
+    return 8 if precision == "int8" else 16
+
+
+# --------------------------------------------------------------------------------------------------- parameters
+
+
+def parameters(source: Source, precision: Precision) -> str:
+    """``upb_params.svh``: one ``localparam`` a line, to be included in a module or package. Raises ExportError."""
+    model, rules = source.integer(precision), source.file.rules
+    lines = [*_shared(source, model, rules)]
+    for which, network in zip(NETWORKS, model, strict=True):
+        lines += _of_network(network, which, precision, rules)
+    about = [f"// {key}: {text}" for key, text in source.describe()]
+    title = f"// Parameters of the {model.contract} networks. Generated from the model file; do not edit."
+    letters = "// Letters and steps: docs/numeric-contract.md. Row limits are packed: row n at [16 * n +: 16]."
+    return "\n".join([title, *about, letters, *lines, ""])
+
+
+def _shared(source: Source, model: IntegerModel, rules: Rules) -> Iterator[str]:
+    narrow = weight_bits(model.precision)
+    yield f'localparam UPB_CONTRACT = "{model.contract}";'
+    yield f"localparam [31:0] UPB_MODEL_CRC32 = 32'h{source.crc32:08x};"
+    for name, value in (
+        ("BLOCK_CODE", int(model.precision == "int8")),
+        ("CODE_BITS", CODE_BITS if model.precision == "int8" else COUNT_BITS),
+        ("WEIGHT_BITS", narrow),
+        ("MINIMUM_BITS", 16),
+        ("BIAS_BITS", SUM_BITS),
+        ("OUTPUT_BITS", narrow),
+        ("SUM_BITS", SUM_BITS),
+        ("HIDDEN_BITS", HIDDEN_BITS),
+        ("HIDDEN_SHIFT", HIDDEN_SHIFT),
+        ("COUNT_BITS", COUNT_BITS),
+        ("INTENSITY_BITS", INTENSITY_BITS),
+        ("COLUMNS", rules.columns),
+        ("MIN_COUNT", rules.min_count),
+        ("MAX_COUNT", rules.max_count),
+        ("EDGE_SEAM", int(rules.edge == "seam")),
+        ("LAST_ROW_EMPTY", int(rules.last_row == "empty")),
+        ("EMPTY_FILL", int(rules.empty == "fill")),
+    ):
+        yield _integer(name, value)
+    yield _packed("SEEN_MAX", rules.row_max_count[0::2])  # of each beam
+    yield _packed("GIVEN_MAX", rules.row_max_count[1:-1:2])  # of each window
+
+
+def _of_network(n: IntegerNetwork, which: NetworkName, precision: Precision, rules: Rules) -> Iterator[str]:
+    largest, difference = largest_inputs(rules, which)
+    for name, value in (
+        ("H", n.hidden),
+        ("K", n.k),
+        ("J", n.j),
+        ("T", n.t),
+        ("SLOPE", n.slope),
+        ("SKIP", n.skip),
+        ("C", n.offset),
+        ("LARGEST_INPUT", largest),
+        ("LARGEST_S", largest_code(precision, difference)[1]),
+    ):
+        yield _integer(f"{which.upper()}_{name}", value)
+
+
+def _integer(name: str, value: int) -> str:
+    """As 32-bit hexadecimal where a decimal would not fit its literal: -2^31."""
+    text = str(value) if value > -(2**31) else "32'sh80000000"
+    return f"localparam signed [31:0] UPB_{name} = {text};"
+
+
+def _packed(name: str, values: I64) -> str:
+    bits = COUNT_BITS * len(values)
+    digits = "".join(f"{int(value):04x}" for value in values[::-1])
+    return f"localparam [{bits - 1}:0] UPB_{name} = {bits}'h{digits};"
