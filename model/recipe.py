@@ -106,7 +106,8 @@ class TrainingRecipe:
     """``plateau``: the learning rate is halved after ``patience`` epochs without a better mean loss."""
     patience: int = 10
     starts: int = 1
-    """Random starts: each runs the first eighth of the steps, the one with the lowest loss goes on."""
+    """Random starts: each runs its share of the steps, the one with the lowest loss goes on."""
+    start_share: float = 0.125
     intensity_gain: float = 0.0
     """Spread of factors drawn for the upper row, the lower row and the target of each intensity window: lasers are not
     alike, and the simulator's are more alike than real ones. The natural logarithm's standard deviation."""
@@ -364,6 +365,8 @@ def _wrong_numbers(recipe: Recipe) -> Iterator[str]:
     yield from _not_positive(positive)
     if not 1 <= training.starts <= 64:
         yield f"training.starts is {training.starts!r}, expected 1 to 64"
+    if not 0 < training.start_share <= 1:
+        yield f"training.start_share is {training.start_share!r}, expected above 0, at most 1"
     for name in ("intensity_gain", "intensity_noise"):
         if not 0 <= getattr(training, name) <= 2:
             yield f"training.{name} is {getattr(training, name)!r}, expected 0 to 2"

@@ -467,7 +467,7 @@ def _best_start(
         return _Run(recipe, name, batches, device, held=held)
     runs = [_Run(recipe, name, batches, device, start, held) for start in range(recipe.training.starts)]
     for run in runs:
-        for _ in range(max(1, run.steps // 8)):
+        for _ in range(max(1, int(run.steps * recipe.training.start_share))):
             run.advance(lambda *_: None)
     return min(runs, key=_recent_loss)
 

@@ -16,18 +16,43 @@ static uint32_t read_xcr0(void) {
     return low;
 }
 
+/* Of leaf 7, registers b and c. */
+#define LEAF7B_AVX2 (1u << 5)
+#define LEAF7B_AVX512_F_DQ_BW_VL (1u << 16 | 1u << 17 | 1u << 30 | 1u << 31)
+#define LEAF7C_AVX512_VNNI (1u << 11)
+
 static int machine_has(upb_cpu cpu) {
-    const uint32_t avx2 = 1u << 5, avx512_f_dq_bw_vl = 1u << 16 | 1u << 17 | 1u << 30 | 1u << 31;
     const uint32_t fma = 1u << 12, osxsave = 1u << 27;
     uint32_t a, b, c, d;
     if (!__get_cpuid(1, &a, &b, &c, &d) || (c & (fma | osxsave)) != (fma | osxsave))
         return 0;
-    if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(b & avx2))
+    if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(b & LEAF7B_AVX2))
         return 0;
-    uint32_t xcr0 = read_xcr0();
+    const uint32_t xcr0 = read_xcr0();
     if (cpu == UPB_CPU_AVX2)
         return (xcr0 & XCR0_AVX) == XCR0_AVX;
-    return (b & avx512_f_dq_bw_vl) == avx512_f_dq_bw_vl && (xcr0 & XCR0_AVX512) == XCR0_AVX512;
+    if ((b & LEAF7B_AVX512_F_DQ_BW_VL) != LEAF7B_AVX512_F_DQ_BW_VL || (xcr0 & XCR0_AVX512) != XCR0_AVX512)
+        return 0;
+    return cpu == UPB_CPU_AVX512 || (c & LEAF7C_AVX512_VNNI);
+}
+
+#endif
+
+#ifdef UPB_HAVE_NEON_DOT
+
+#ifdef __linux__
+#include <sys/auxv.h>
+#define HWCAP_DOT (1ul << 20) /* HWCAP_ASIMDDP; older headers do not name it */
+#endif
+
+static int machine_has_dot(void) {
+#ifdef __linux__
+    return (getauxval(AT_HWCAP) & HWCAP_DOT) != 0;
+#elif defined(__ARM_FEATURE_DOTPROD)
+    return 1;
+#else
+    return 0;
+#endif
 }
 
 #endif
@@ -41,25 +66,45 @@ static int fill(upb_kernels *kernels, upb_cpu cpu) {
         if (machine_has(UPB_CPU_AVX2)) /* which includes FMA */
             upb_kernels_fill_c_fma(kernels);
 #endif
+        upb_kernels_fill_int_c(kernels);
         return 1;
 #ifdef UPB_HAVE_AVX2
     case UPB_CPU_AVX2:
-        if (!machine_has(UPB_CPU_AVX2))
+        if (!machine_has(cpu))
             return 0;
         upb_kernels_fill_avx2(kernels);
+        upb_kernels_fill_int_avx2(kernels);
         return 1;
 #endif
 #ifdef UPB_HAVE_AVX512
     case UPB_CPU_AVX512:
-        if (!machine_has(UPB_CPU_AVX512))
+        if (!machine_has(cpu))
             return 0;
         upb_kernels_fill_avx512(kernels);
+        upb_kernels_fill_int_avx512(kernels);
         return 1;
+#ifdef UPB_HAVE_AVX512_VNNI
+    case UPB_CPU_AVX512_VNNI:
+        if (!machine_has(cpu))
+            return 0;
+        upb_kernels_fill_avx512(kernels);
+        upb_kernels_fill_int_avx512_vnni(kernels);
+        return 1;
+#endif
 #endif
 #ifdef UPB_HAVE_NEON
     case UPB_CPU_NEON: /* part of every AArch64 */
         upb_kernels_fill_neon(kernels);
+        upb_kernels_fill_int_neon(kernels);
         return 1;
+#ifdef UPB_HAVE_NEON_DOT
+    case UPB_CPU_NEON_DOT:
+        if (!machine_has_dot())
+            return 0;
+        upb_kernels_fill_neon(kernels);
+        upb_kernels_fill_int_neon_dot(kernels);
+        return 1;
+#endif
 #endif
     default:
         return 0;
@@ -67,7 +112,8 @@ static int fill(upb_kernels *kernels, upb_cpu cpu) {
 }
 
 upb_cpu upb_kernels_select(upb_kernels *kernels, upb_cpu cpu) {
-    static const uint8_t fastest_first[] = {UPB_CPU_AVX512, UPB_CPU_NEON, UPB_CPU_AVX2, UPB_CPU_SCALAR};
+    static const uint8_t fastest_first[] = {UPB_CPU_AVX512_VNNI, UPB_CPU_AVX512, UPB_CPU_NEON_DOT,
+                                            UPB_CPU_NEON,        UPB_CPU_AVX2,   UPB_CPU_SCALAR};
     if (cpu != UPB_CPU_AUTO)
         return fill(kernels, cpu) ? cpu : UPB_CPU_AUTO;
     for (unsigned i = 0; i < sizeof fastest_first; i++)

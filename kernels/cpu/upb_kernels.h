@@ -16,6 +16,13 @@
 
 #include "upbeam/upbeam.h"
 
+/* For functions that are made for constant arguments, of which they have several. */
+#ifdef __GNUC__
+#define UPB_INLINE static inline __attribute__((always_inline))
+#else
+#define UPB_INLINE static inline
+#endif
+
 #define UPB_LANES 32u /* UPB_WINDOWS and one lane of padding */
 #define UPB_TAPS 7    /* inputs of a network: six window pixels, as differences from their minimum, and the minimum */
 #define UPB_TAP_MINIMUM 6
@@ -78,10 +85,67 @@ typedef void (*upb_windows_f32_fn)(const upb_model_f32 *model, const upb_prepare
 typedef void (*upb_raw_f32_fn)(const upb_model_f32 *model, const upb_prepared_f32 *left, const upb_prepared_f32 *middle,
                                const upb_prepared_f32 *right, float *distance, float *intensity);
 
+/* ------------------------------------------------------------------------------------------- integer networks */
+
+/*
+ * One integer network (docs/numeric-contract.md), widened to what both contracts share; made by upb_network_int_finish
+ * of a network as the file has it. Units are padded to an even number with zeros, so that kernels may take two at a
+ * time. A unit's six weights, the minimum's and a zero are four pairs of 16 bits.
+ *
+ * In int8, W << min(k, 8) still fits 16 bits, and (q << s) << (k - 8) fits as well: `weight` and `k` are so, and an
+ * int8 network is an int16 network of the codes q << s. Kernels that multiply bytes take `weight8` (eight bytes with
+ * two zeros), `k8` and what belongs to them; in int16 these are 0.
+ *
+ * `bias` includes the rounding of step 5, `offset` that of step 8. What is unsigned here, a kernel may take as signed,
+ * 32768 less: `bias_signed` is the bias of one that does so with the inputs (shifted by k) and the minimum (by j),
+ * `bias8` that of one that does so with the minimum alone. `dot_signed` is 128 * sum of W: where a kernel takes q -
+ * 128, its sums of products begin here. All are exact modulo 2^32.
+ */
+typedef struct upb_network_int {
+    _Alignas(UPB_ALIGN) int16_t weight[UPB_MAX_HIDDEN][8]; /* W[0..5], M, 0 */
+    _Alignas(UPB_ALIGN) int32_t bias[UPB_MAX_HIDDEN];
+    _Alignas(UPB_ALIGN) int32_t bias_signed[UPB_MAX_HIDDEN];
+    _Alignas(UPB_ALIGN) int16_t output[UPB_MAX_HIDDEN]; /* V */
+    _Alignas(UPB_ALIGN) int8_t weight8[UPB_MAX_HIDDEN][8];
+    _Alignas(UPB_ALIGN) int32_t bias8[UPB_MAX_HIDDEN];
+    _Alignas(UPB_ALIGN) int32_t dot_signed[UPB_MAX_HIDDEN];
+    int32_t offset;
+    uint32_t hidden; /* even, 2..UPB_MAX_HIDDEN */
+    uint32_t k, j, t;
+    uint32_t k8;
+    int32_t slope; /* 0..32767 */
+    uint32_t skip; /* 0, 1 */
+} upb_network_int;
+
+/* What an integer kernel needs of a model. The proof against overflow has been made of `network`. */
+typedef struct upb_model_int {
+    upb_network_int network[2];                        /* UPB_DISTANCE, UPB_INTENSITY */
+    _Alignas(UPB_ALIGN) uint16_t seen_max[UPB_LANES];  /* as in upb_model_f32 */
+    _Alignas(UPB_ALIGN) uint16_t given_max[UPB_LANES]; /* the last lane is padding */
+    uint16_t min_count;
+    uint16_t fill;
+} upb_model_int;
+
+/* A column as windows see it, as upb_prepared_f32. */
+typedef struct upb_prepared_int {
+    _Alignas(UPB_ALIGN) uint16_t row[UPB_PREPARED_ROWS][UPB_LANES];
+} upb_prepared_int;
+
+typedef void (*upb_prepare_int_fn)(upb_prepared_int *prepared, const upb_model_int *model, const uint16_t *distance,
+                                   const uint8_t *intensity);
+
+/* As upb_windows_f32_fn, to the bit of the contract. One function for each contract. */
+typedef void (*upb_windows_int_fn)(const upb_model_int *model, const upb_prepared_int *left,
+                                   const upb_prepared_int *middle, const upb_prepared_int *right, uint16_t *distance,
+                                   uint8_t *intensity);
+
 typedef struct upb_kernels {
     upb_prepare_f32_fn prepare_f32;
     upb_windows_f32_fn windows_f32;
     upb_raw_f32_fn raw_f32;
+    upb_prepare_int_fn prepare_int;
+    upb_windows_int_fn windows_int16;
+    upb_windows_int_fn windows_int8;
 } upb_kernels;
 
 /*
@@ -90,11 +154,20 @@ typedef struct upb_kernels {
  */
 upb_cpu upb_kernels_select(upb_kernels *kernels, upb_cpu cpu);
 
-/* Each in its own file, compiled with the flags of its instruction set: call only where the machine has it. */
+/*
+ * Each in its own file, compiled with the flags of its instruction set: call only where the machine has it. They fill
+ * in the float kernels, or with _int_ the integer ones.
+ */
 void upb_kernels_fill_c(upb_kernels *kernels);
 void upb_kernels_fill_c_fma(upb_kernels *kernels);
 void upb_kernels_fill_avx2(upb_kernels *kernels);
 void upb_kernels_fill_avx512(upb_kernels *kernels);
 void upb_kernels_fill_neon(upb_kernels *kernels);
+void upb_kernels_fill_int_c(upb_kernels *kernels);
+void upb_kernels_fill_int_avx2(upb_kernels *kernels);
+void upb_kernels_fill_int_avx512(upb_kernels *kernels);
+void upb_kernels_fill_int_avx512_vnni(upb_kernels *kernels);
+void upb_kernels_fill_int_neon(upb_kernels *kernels);
+void upb_kernels_fill_int_neon_dot(upb_kernels *kernels);
 
 #endif /* UPB_KERNELS_H */

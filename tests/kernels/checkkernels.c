@@ -1,6 +1,7 @@
 /*
  * Every window kernel of this machine against the plain C one, on random and extreme columns; with --bench the very
- * same calls are timed. Options: --seed N, --rounds N (models to check), --model FILE.ubm (a trained one), --bench.
+ * same calls are timed. Integer kernels: see integer.h. Options: --seed N, --rounds N (models to check), --model
+ * FILE.ubm (a trained one), --bench, --require NAME (an instruction set that must be there).
  *
  * All kernels that a machine with fused products chooses, the scalar one included, agree to the bit. What may differ is
  * plain C on a machine without them: it rounds twice where the others round once. So raw outputs agree within 1e-5 of
@@ -13,15 +14,16 @@
 #include <time.h>
 
 #include "check.h"
+#include "columns.h"
 #include "upb_internal.h"
+
+static const char *const cpu_names[] = {"auto", "c", "avx2", "avx512", "neon", "vnni", "dot"};
+enum { LAST_CPU = UPB_CPU_NEON_DOT };
+
+#include "integer.h"
 
 #define TOLERANCE 1e-5
 #define SCENE_TOLERANCE 0.01
-
-typedef struct raw_column {
-    uint16_t distance[UPB_BEAMS];
-    uint8_t intensity[UPB_BEAMS];
-} raw_column;
 
 typedef struct result {
     float raw[2][UPB_LANES];
@@ -37,8 +39,6 @@ typedef struct parameters {
     int scene;
     const upb_model_f32 *model;
 } parameters;
-
-static const char *const cpu_names[] = {"auto", "c", "avx2", "avx512", "neon"};
 
 /* Of everything, and of the trained model on scenes. */
 static struct {
@@ -81,47 +81,10 @@ static void random_model_f32(random_source *random, upb_model_f32 *model, uint32
     model->fill = random_below(random, 2);
 }
 
-static const char *const patterns[] = {"scene",       "random", "sparse", "zero",  "max",
-                                       "alternating", "single", "equal",  "limits"};
-enum { SCENE = 0, ALL_MAX = 4, ALL_EQUAL = 7, PATTERNS = sizeof patterns / sizeof patterns[0] };
-
-static uint16_t pattern_distance(random_source *random, unsigned pattern, const upb_model_f32 *model, unsigned k,
-                                 unsigned chosen) {
-    const uint32_t low = (uint32_t)model->min_count, high = (uint32_t)model->seen_max[31];
-    const uint16_t within = (uint16_t)(low + random_below(random, high - low + 1));
-    switch (pattern) {
-    case SCENE: /* smooth surfaces some steps apart, a return in ten missing */
-        return random_below(random, 10) ? (uint16_t)(low + (high - low) / 2 + 40 * (k / 8) + random_below(random, 20))
-                                        : 0;
-    case 1:
-        return within;
-    case 2:
-        return random_below(random, 3) ? 0 : within;
-    case 3:
-        return 0;
-    case ALL_MAX:
-        return 65535;
-    case 5:
-        return k % 2 ? (uint16_t)high : 0;
-    case 6:
-        return k == chosen % UPB_BEAMS ? within : 0;
-    case ALL_EQUAL:
-        return (uint16_t)(low + chosen % (high - low + 1));
-    default: { /* just inside and just outside */
-        const uint32_t near_limit[4] = {low - 1, low, high, high + 1};
-        return (uint16_t)near_limit[random_below(random, 4)];
-    }
-    }
-}
-
-static void pattern_column(random_source *random, unsigned pattern, const upb_model_f32 *model, raw_column *column) {
-    const unsigned chosen = random_u32(random);
-    for (unsigned k = 0; k < UPB_BEAMS; k++) {
-        column->distance[k] = pattern_distance(random, pattern, model, k, chosen);
-        column->intensity[k] = (uint8_t)(pattern == ALL_MAX     ? 255
-                                         : pattern == ALL_EQUAL ? chosen >> 8
-                                                                : random_below(random, 256));
-    }
+static void pattern_columns(random_source *random, const unsigned pattern[3], const upb_model_f32 *model,
+                            raw_column column[3]) {
+    for (int c = 0; c < 3; c++)
+        pattern_column(random, pattern[c], (uint32_t)model->min_count, (uint32_t)model->seen_max[31], &column[c]);
 }
 
 /* -------------------------------------------------------------------------------------------- comparison */
@@ -215,7 +178,7 @@ static void compare_kernels(parameters *p, const raw_column column[3]) {
     upb_kernels kernels;
     upb_kernels_fill_c(&kernels);
     run(&kernels, p->model, column, &expected);
-    for (int cpu = UPB_CPU_SCALAR; cpu <= UPB_CPU_NEON; cpu++) {
+    for (int cpu = UPB_CPU_SCALAR; cpu <= LAST_CPU; cpu++) {
         result got;
         if (upb_kernels_select(&kernels, (upb_cpu)cpu) != (upb_cpu)cpu)
             continue;
@@ -239,11 +202,9 @@ static void check_round(parameters *p, random_source *random) {
     p->scene = 0;
     for (unsigned i = 0; i < 3 * PATTERNS * PATTERNS; i++) {
         raw_column column[3];
-        const unsigned middle = i % PATTERNS, left = i / PATTERNS % PATTERNS;
-        pattern_column(random, left, &model, &column[0]);
-        pattern_column(random, middle, &model, &column[1]);
-        pattern_column(random, random_below(random, PATTERNS), &model, &column[2]);
-        p->pattern = patterns[middle];
+        const unsigned pattern[3] = {i / PATTERNS % PATTERNS, i % PATTERNS, random_below(random, PATTERNS)};
+        pattern_columns(random, pattern, &model, column);
+        p->pattern = patterns[pattern[1]];
         compare_kernels(p, column);
     }
 }
@@ -254,8 +215,7 @@ static void check_scenes(parameters *p, random_source *random, const upb_model_f
     p->pattern = patterns[SCENE];
     for (unsigned i = 0; i < 20000; i++) {
         raw_column column[3];
-        for (int c = 0; c < 3; c++)
-            pattern_column(random, SCENE, model, &column[c]);
+        pattern_columns(random, (const unsigned[3]){SCENE, SCENE, SCENE}, model, column);
         compare_kernels(p, column);
     }
     printf("%llu windows of scenes compared, %llu flips at thresholds\n", scenes.windows, scenes.flips);
@@ -318,8 +278,16 @@ static int compare_doubles(const void *a, const void *b) {
 
 enum { BENCH_COLUMNS = 2048, BENCH_RUNS = 51, BENCH_HIDDEN = 12 };
 
+/* Models to time: trained where the file has the precision, else random ones of BENCH_HIDDEN units. */
+typedef struct bench_models {
+    upb_model_f32 f32;
+    upb_model_int integer[2];
+} bench_models;
+
+static const char *const precision_names[] = {"float", "int16", "int8"};
+
 /* Seconds for BENCH_COLUMNS columns: preparing each, and both networks on its windows. */
-static double time_image(const upb_kernels *kernels, const upb_model_f32 *model, const raw_column *columns) {
+static double time_f32(const upb_kernels *kernels, const upb_model_f32 *model, const raw_column *columns) {
     static upb_prepared_f32 prepared[3];
     static uint16_t distance[BENCH_COLUMNS][UPB_LANES];
     static uint8_t intensity[BENCH_COLUMNS][UPB_LANES];
@@ -332,12 +300,27 @@ static double time_image(const upb_kernels *kernels, const upb_model_f32 *model,
     return seconds_now() - start;
 }
 
-static void report(const char *cpu_name, const char *what, double *seconds) {
+static double time_int(const upb_kernels *kernels, upb_windows_int_fn windows, const upb_model_int *model,
+                       const raw_column *columns) {
+    static upb_prepared_int prepared[3];
+    static uint16_t distance[BENCH_COLUMNS][UPB_LANES];
+    static uint8_t intensity[BENCH_COLUMNS][UPB_LANES];
+    const double start = seconds_now();
+    for (unsigned c = 0; c < BENCH_COLUMNS; c++) {
+        kernels->prepare_int(&prepared[c % 3], model, columns[c].distance, columns[c].intensity);
+        windows(model, &prepared[(c + 1) % 3], &prepared[(c + 2) % 3], &prepared[c % 3], distance[c], intensity[c]);
+    }
+    return seconds_now() - start;
+}
+
+/* Prints the least and the median of BENCH_RUNS; returns the median. */
+static double report(const char *cpu_name, const char *what, const char *precision, double *seconds) {
     qsort(seconds, BENCH_RUNS, sizeof seconds[0], compare_doubles);
     const double least = seconds[0], median = seconds[BENCH_RUNS / 2];
-    printf("%-7s %-7s %8.1f %8.1f ns per column, %7.3f %7.3f ms per image of %d columns (min, median; measured)\n",
-           cpu_name, what, least / BENCH_COLUMNS * 1e9, median / BENCH_COLUMNS * 1e9, least * 1e3, median * 1e3,
-           BENCH_COLUMNS);
+    printf("%-7s %-7s %-6s %8.1f %8.1f ns per column, %7.3f %7.3f ms per image of %d columns (min, median; measured)\n",
+           cpu_name, what, precision, least / BENCH_COLUMNS * 1e9, median / BENCH_COLUMNS * 1e9, least * 1e3,
+           median * 1e3, BENCH_COLUMNS);
+    return median;
 }
 
 static uint32_t column_sum;
@@ -348,7 +331,7 @@ static void use_column(void *user, const upb_column *column) {
 }
 
 /* The whole step of a stream: destagger ring, both networks, interleaving, sink; and the same as whole frames. */
-static void bench_stream(upb_cpu cpu, const upb_model *model, const raw_column *columns) {
+static void bench_stream(upb_cpu cpu, upb_precision precision, const upb_model *model, const raw_column *columns) {
     static _Alignas(UPB_ALIGN) unsigned char memory[1 << 18];
     static uint16_t in_d[UPB_BEAMS][BENCH_COLUMNS], out_d[UPB_ROWS][BENCH_COLUMNS];
     static uint8_t in_i[UPB_BEAMS][BENCH_COLUMNS], out_i[UPB_ROWS][BENCH_COLUMNS];
@@ -357,6 +340,7 @@ static void bench_stream(upb_cpu cpu, const upb_model *model, const raw_column *
     upb_stream *stream;
     upb_stream_config config = upb_stream_config_default();
     config.cpu = cpu;
+    config.precision = precision;
     config.columns = BENCH_COLUMNS;
     config.any_sensor = 1;
     config.sink = use_column;
@@ -378,30 +362,54 @@ static void bench_stream(upb_cpu cpu, const upb_model *model, const raw_column *
     upb_stream_stats stats;
     upb_stream_get_stats(stream, &stats);
     CHECK(stats.columns_late == 0 && stats.columns_missing == 0 && written == BENCH_COLUMNS);
-    report(cpu_names[cpu], "push", pushed);
-    report(cpu_names[cpu], "frame", framed);
+    report(cpu_names[cpu], "push", precision_names[precision], pushed);
+    report(cpu_names[cpu], "frame", precision_names[precision], framed);
 }
 
-/* With a trained model if there is one, else with a random one of BENCH_HIDDEN units. */
-static void bench(upb_cpu cpu, const upb_model *trained, random_source *random) {
+static void choose_models(bench_models *models, const upb_model *trained, random_source *random) {
+    static int_model made;
+    random_model_f32(random, &models->f32, BENCH_HIDDEN, 0);
+    models->f32.network[UPB_INTENSITY].hidden = BENCH_HIDDEN;
+    models->f32.fill = 1;
+    if (trained)
+        models->f32 = trained->f32;
+    for (int i = 0; i < 2; i++) {
+        const upb_precision precision = i ? UPB_PRECISION_INT8 : UPB_PRECISION_INT16;
+        if (trained && upb_model_has(trained, precision)) {
+            models->integer[i] = *upb_model_integer(trained, precision);
+            continue;
+        }
+        random_int_model(random, &made, precision, BENCH_HIDDEN, 1);
+        models->integer[i] = made.ready;
+        models->integer[i].fill = 1;
+        for (int which = 0; which < 2; which++) {
+            models->integer[i].network[which].hidden = BENCH_HIDDEN;
+            models->integer[i].network[which].slope = 328;
+        }
+    }
+}
+
+/* All precisions of one instruction set by turns, and with a trained model the streams that it can feed. */
+static void bench(upb_cpu cpu, const bench_models *models, const upb_model *trained, random_source *random) {
     static raw_column columns[BENCH_COLUMNS];
-    static upb_model_f32 model;
-    double seconds[BENCH_RUNS];
+    double seconds[UPB_PRECISIONS][BENCH_RUNS], median[UPB_PRECISIONS];
     upb_kernels kernels;
     if (upb_kernels_select(&kernels, cpu) != cpu)
         return;
-    random_model_f32(random, &model, BENCH_HIDDEN, 0);
-    model.network[UPB_INTENSITY].hidden = BENCH_HIDDEN;
-    model.fill = 1;
-    if (trained)
-        model = trained->f32;
     for (unsigned c = 0; c < BENCH_COLUMNS; c++)
-        pattern_column(random, c % 2, &model, &columns[c]);
-    for (unsigned i = 0; i < BENCH_RUNS; i++)
-        seconds[i] = time_image(&kernels, &model, columns);
-    report(cpu_names[cpu], "kernel", seconds);
-    if (trained)
-        bench_stream(cpu, trained, columns);
+        pattern_column(random, c % 2, (uint32_t)models->f32.min_count, (uint32_t)models->f32.seen_max[31], &columns[c]);
+    for (unsigned i = 0; i < BENCH_RUNS; i++) {
+        seconds[0][i] = time_f32(&kernels, &models->f32, columns);
+        seconds[1][i] = time_int(&kernels, kernels.windows_int16, &models->integer[0], columns);
+        seconds[2][i] = time_int(&kernels, kernels.windows_int8, &models->integer[1], columns);
+    }
+    for (unsigned p = 0; p < UPB_PRECISIONS; p++)
+        median[p] = report(cpu_names[cpu], "kernel", precision_names[p], seconds[p]);
+    printf("%-7s float takes %.2f times as long as int16, %.2f times as long as int8\n", cpu_names[cpu],
+           median[0] / median[1], median[0] / median[2]);
+    for (unsigned p = 0; trained && p < UPB_PRECISIONS; p++)
+        if (upb_model_has(trained, p))
+            bench_stream(cpu, (upb_precision)p, trained, columns);
 }
 
 static const upb_model *load(const char *path) {
@@ -420,6 +428,23 @@ static const upb_model *load(const char *path) {
     return model;
 }
 
+/* Known answers and, if asked for, times of every instruction set. `required`: the name of one that must be there. */
+static void visit_cpus(const upb_model *model, int is_bench, const char *required, random_source random) {
+    static bench_models models;
+    choose_models(&models, model, &random);
+    for (int cpu = UPB_CPU_SCALAR; cpu <= LAST_CPU; cpu++) {
+        upb_kernels kernels;
+        if (upb_kernels_select(&kernels, (upb_cpu)cpu) != (upb_cpu)cpu) {
+            CHECK(cpu != UPB_CPU_SCALAR && (!required || strcmp(cpu_names[cpu], required)));
+            printf("%-7s not on this machine or not in this build\n", cpu_names[cpu]);
+            continue;
+        }
+        check_by_hand(&kernels);
+        if (is_bench)
+            bench((upb_cpu)cpu, &models, model, &random);
+    }
+}
+
 int main(int argc, char **argv) {
     parameters p = {.seed = option_number(argc, argv, "--seed", (unsigned long)time(NULL))};
     const unsigned rounds = (unsigned)option_number(argc, argv, "--rounds", 2 * UPB_MAX_HIDDEN);
@@ -427,20 +452,11 @@ int main(int argc, char **argv) {
     const upb_model *model = path ? load(path) : NULL;
     random_source random = random_seeded(p.seed);
     printf("checkkernels --seed %lu --rounds %u\n", p.seed, rounds);
-    for (int cpu = UPB_CPU_SCALAR; cpu <= UPB_CPU_NEON; cpu++) {
-        upb_kernels kernels;
-        if (upb_kernels_select(&kernels, (upb_cpu)cpu) != (upb_cpu)cpu) {
-            CHECK(cpu != UPB_CPU_SCALAR);
-            printf("%-8s not on this machine or not in this build\n", cpu_names[cpu]);
-            continue;
-        }
-        check_by_hand(&kernels);
-        if (option_given(argc, argv, "--bench"))
-            bench((upb_cpu)cpu, model, &random);
-    }
+    visit_cpus(model, option_given(argc, argv, "--bench"), option_text(argc, argv, "--require"), random);
     for (p.round = 0; p.round < rounds; p.round++)
         check_round(&p, &random);
     printf("%llu windows compared, %llu flips at thresholds\n", all.windows, all.flips);
+    check_integers(p.seed, rounds, &random);
     if (model)
         check_scenes(&p, &random, &model->f32);
     else
