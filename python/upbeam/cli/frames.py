@@ -78,7 +78,8 @@ def _simulation(file: ModelFile) -> tuple[Recipe, DataRecipe]:
         rules = recipe.make_rules()
         sources = [source for source in recipe.data if source.source == "simulator"]
         if sources and (rules.sensor, rules.columns) == (file.rules.sensor, file.rules.columns):
-            return recipe, sources[0]
+            own = [source for source in sources if source.columns in (0, recipe.columns)]
+            return recipe, (own or sources)[0]
     sensor = file.rules.sensor
     table = sensor.removesuffix("/2")
     if table not in beam_table_names():

@@ -9,7 +9,7 @@ import typer
 
 import upbeam
 
-from . import doctor, evaluate, inspect, ops, simulate, stream, train, upsample
+from . import doctor, evaluate, export, inspect, ops, quantize, simulate, stream, train, upsample, verify
 from .common import message
 
 __all__ = ["app", "run"]
@@ -27,6 +27,9 @@ app.command("ops")(ops.ops)
 app.command("evaluate")(evaluate.evaluate)
 app.command("train")(train.train)
 app.command("simulate")(simulate.simulate)
+app.command("quantize")(quantize.quantize)
+app.command("verify")(verify.verify)
+app.command("export")(export.export)
 app.command("inspect")(inspect.inspect)
 app.command("doctor")(doctor.doctor)
 
