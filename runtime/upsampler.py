@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from upbeam.kernels.opencl import OpenClUpsampler
 from upbeam.model.geometry import to_counts, to_metres
 from upbeam.model.rules import BEAMS, ROWS, Rules
 from upbeam.quant.ubm import ModelFile, UbmError, read_ubm
@@ -38,7 +40,7 @@ U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 
 DEFAULT_MODEL = "hdl-64e"
-BACKENDS = ("cpu",)
+BACKENDS = ("cpu", "opencl")
 """Of this version."""
 
 
@@ -163,6 +165,7 @@ class Upsampler:
         cpu: str = "auto",
     ) -> None:
         """``precision``: ``fp32``, ``int16`` or ``int8``; the integers give the same bits on every machine.
+        ``backend``: ``cpu``, or ``opencl`` (extra ``opencl``; whole images only).
         ``columns``: width of the images where it is not the model's. ``cpu``: force one of ``CPUS``.
 
         Raises ValueError for what the model, this machine or this version does not have.
@@ -183,6 +186,9 @@ class Upsampler:
             any_sensor=columns is not None,
             aligned=True,
         )
+        self._image: Callable[[U16, U8], tuple[U16, U8]] = self._stream.image
+        if backend == "opencl":
+            self._image = OpenClUpsampler(model.file, precision, self.columns)
 
     @property
     def cpu(self) -> str:
@@ -204,9 +210,9 @@ class Upsampler:
         d, i = np.asarray(distance), np.asarray(intensity)
         self._check(d, i)
         if d.dtype == np.uint16:
-            return self._stream.image(np.ascontiguousarray(d), np.ascontiguousarray(i))
+            return self._image(np.ascontiguousarray(d), np.ascontiguousarray(i))
         counts, _ = to_counts(d, self.model.distance_unit_m)
-        out, grey = self._stream.image(counts, np.ascontiguousarray(i))
+        out, grey = self._image(counts, np.ascontiguousarray(i))
         metres = to_metres(out, self.model.distance_unit_m)
         metres[0::2] = d
         if self.model.rules.last_row == "repeat":
@@ -214,7 +220,9 @@ class Upsampler:
         return metres, grey
 
     def stream(self, *, aligned: bool = False) -> ColumnStream:
-        """A column stream. ``aligned``: the columns are destaggered already."""
+        """A column stream. ``aligned``: the columns are destaggered already. Only on the backend ``cpu``."""
+        if self.backend != "cpu":
+            raise ValueError(f"backend {self.backend} takes whole images; a column stream runs on the cpu")
         return ColumnStream(self.model, self.precision, columns=self.columns, cpu=self._cpu, aligned=aligned)
 
     def _check(self, distance: NDArray[Any], intensity: NDArray[Any]) -> None:

@@ -1,4 +1,4 @@
-"""The C runtime's kernels as backends of ``quant.verify``."""
+"""The C runtime's kernels, and OpenCL devices, as backends of ``quant.verify``."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from upbeam.kernels.opencl import OpenClUpsampler, list_devices
 from upbeam.quant.verify import Backend, Image, NetworkName
 
 from . import _native
 from .upsampler import ColumnStream, Model, Upsampler
 
-__all__ = ["CPUS", "cpu_backends"]
+__all__ = ["CPUS", "cpu_backends", "opencl_backends"]
 
 CPUS = tuple(name for name in _native.CPUS if name != "auto")
 _CHUNKS = (1, 2, 31, 64, 7, 500, 3)
@@ -26,6 +27,23 @@ def cpu_backends(model: Model, precision: str) -> list[Backend]:
     Raises ValueError where the model does not have the precision.
     """
     return [_backend(model, precision, cpu) for cpu in CPUS if _usable(model, precision, cpu)]
+
+
+def opencl_backends(model: Model, precision: str) -> list[Backend]:
+    """One for each OpenCL device, whole images only. Raises OpenClError where there is none."""
+    return [_opencl_backend(model, precision, device.index) for device in list_devices()]
+
+
+def _opencl_backend(model: Model, precision: str, device: int) -> Backend:
+    made: dict[int, OpenClUpsampler] = {}
+
+    def image(given: Image) -> Image:
+        width = given[0].shape[1]
+        if width not in made:
+            made[width] = OpenClUpsampler(model.file, precision, width, device)
+        return made[width](np.ascontiguousarray(given[0]), np.ascontiguousarray(given[1]))
+
+    return Backend(f"opencl {device}", image)
 
 
 def _usable(model: Model, precision: str, cpu: str) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import upbeam
+from upbeam.kernels.opencl import OpenClError, list_devices
 from upbeam.runtime import _native
 from upbeam.runtime.upsampler import load_model
 
@@ -65,13 +66,9 @@ def _usable_sets() -> list[str]:
 
 def _opencl_devices() -> list[str] | str:
     try:
-        import pyopencl
-    except ImportError:
-        return "pyopencl is not installed (this version has no OpenCL backend)"
-    try:
-        return [f"{p.name}: {d.name}" for p in pyopencl.get_platforms() for d in p.get_devices()]
-    except pyopencl.Error as error:
-        return f"no OpenCL platform: {error}"
+        return [str(device) for device in list_devices()]
+    except OpenClError as error:
+        return str(error)
 
 
 def _self_test() -> str:

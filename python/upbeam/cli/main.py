@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 import upbeam
+from upbeam.kernels.opencl import OpenClError
 
 from . import doctor, evaluate, export, inspect, ops, quantize, simulate, stream, train, upsample, verify
 from .common import message
@@ -66,6 +67,9 @@ def run() -> None:
         sys.exit(130)
     except OSError as error:
         message(f"upbeam: {error.filename or ''}{': ' if error.filename else ''}{error.strerror or error}")
+        sys.exit(2)
+    except OpenClError as error:
+        message(f"upbeam: {error}")  # a build failure has its log below the line
         sys.exit(2)
     except ValueError as error:
         message(f"upbeam: {_one_line(str(error))}")

@@ -14,7 +14,7 @@ from upbeam.model.frames import RowRule, image_of_cloud
 from upbeam.model.geometry import to_counts, to_metres, to_points
 from upbeam.model.io import CloudError, RangeArrays, read_cloud, read_npy, write_bin, write_npz, write_pcd, write_ply
 from upbeam.model.rules import BEAMS, ROWS
-from upbeam.runtime.upsampler import PRECISIONS, Model, Upsampler, generated_rows, load_model
+from upbeam.runtime.upsampler import BACKENDS, PRECISIONS, Model, Upsampler, generated_rows, load_model
 
 from .common import JsonOption, UserError, emit_json, message
 
@@ -29,7 +29,7 @@ def upsample(
     output: Annotated[Path, typer.Option("-o", "--output", help=".npz, .bin, .ply or .pcd.")],
     model: Annotated[str | None, typer.Option(help="A .ubm file, or hdl-32e or vlp-32c instead of hdl-64e.")] = None,
     precision: Annotated[str, typer.Option(help=", ".join(PRECISIONS) + ".")] = "fp32",
-    backend: Annotated[str, typer.Option(help="cpu.")] = "cpu",
+    backend: Annotated[str, typer.Option(help=", ".join(BACKENDS) + ".")] = "cpu",
     rows: Annotated[
         str, typer.Option(help="How a cloud's points find their rows: ring (file order) or elevation.")
     ] = "ring",

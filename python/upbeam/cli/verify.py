@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from upbeam.kernels.opencl import OpenClError
 from upbeam.model.frames import Frame
 from upbeam.quant.verify import (
     GOLDEN,
@@ -26,7 +27,7 @@ from upbeam.quant.verify import (
 )
 from upbeam.quant.verify import verify as compare_backends
 from upbeam.runtime.upsampler import Model, load_model
-from upbeam.runtime.verify import cpu_backends
+from upbeam.runtime.verify import cpu_backends, opencl_backends
 
 from .common import JsonOption, UserError, emit_json, message, progress_bar, show, table
 from .frames import SIMULATED, FrameSet, model_frames
@@ -38,7 +39,7 @@ REFERENCE = "numpy"
 NOTE = (
     "measured here: windows compared, and in words where any differ. Every output row is compared, distance and "
     "intensity. Integer backends stand against the NumPy reference of the contract, which stands against the digest in "
-    "the model file; float ones against the first of their own. -: what the others are compared with."
+    "the model file; float ones against the first of their own. -: what the others are compared with, or not what a backend does."
 )
 
 
@@ -103,7 +104,7 @@ def _given(frame: Frame, model: Model) -> Any:
 def _verify(
     model: Model, precision: str, sets: Sequence[VectorSet], notes: list[str], *, quiet: bool
 ) -> dict[str, BackendResult]:
-    backends = cpu_backends(model, precision)
+    backends = [*cpu_backends(model, precision), *_opencl(model, precision, notes)]
     if precision == "fp32":
         reference, *backends = backends
         first = BackendResult({vectors.name: None for vectors in sets})
@@ -113,6 +114,14 @@ def _verify(
     with progress_bar(f"verifying {precision}", len(sets) * len(backends), quiet=quiet) as advance:
         found = compare_backends(reference, backends, sets, model.rules, lambda name: advance(note=name))
     return {reference.name: first, **found}
+
+
+def _opencl(model: Model, precision: str, notes: list[str]) -> list[Backend]:
+    try:
+        return opencl_backends(model, precision)
+    except OpenClError as error:
+        notes.append(f"{precision}: no OpenCL: {error}")
+        return []
 
 
 def _reference(

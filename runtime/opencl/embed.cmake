@@ -1,0 +1,10 @@
+# cmake -DOUTPUT=file.h -DINPUTS="a.cl;b.cl" -P embed.cmake: each file as a zero terminated array upb_cl_<name>.
+set(text "/* Made from kernels/opencl by embed.cmake. */\n")
+foreach(file IN LISTS INPUTS)
+    get_filename_component(name ${file} NAME_WE)
+    file(READ ${file} content HEX)
+    string(REGEX REPLACE "(..)" "0x\\1," content "${content}")
+    string(REGEX REPLACE "(................................................................................)" "\\1\n    " content "${content}")
+    string(APPEND text "static const char upb_cl_${name}[] = {\n    ${content}0};\n")
+endforeach()
+file(WRITE ${OUTPUT} "${text}")
