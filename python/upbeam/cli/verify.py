@@ -39,7 +39,8 @@ REFERENCE = "numpy"
 NOTE = (
     "measured here: windows compared, and in words where any differ. Every output row is compared, distance and "
     "intensity. Integer backends stand against the NumPy reference of the contract, which stands against the digest in "
-    "the model file; float ones against the first of their own. -: what the others are compared with, or not what a backend does."
+    "the model file; float ones against the first of their own. -: what others are compared with, or what a backend "
+    "does not do."
 )
 
 
