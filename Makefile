@@ -18,7 +18,7 @@ help:
 	@echo "make lint        style and types"
 	@echo "make bench       kernel tests and benchmarks"
 	@echo "make soak        the long runs (about 15 minutes)"
-	@echo "make model       train the shipped model anew"
+	@echo "make model       train and quantise the shipped models anew"
 	@echo "make accuracy    every method beside every other (trains what is not shipped: half an hour)"
 	@echo "make clean       remove everything built"
 
@@ -81,11 +81,14 @@ lint: $(VENV)/.dev
 	$(BIN)/mypy -p upbeam
 	$(BIN)/lint-imports
 
+# Networks are trained, then quantised on simulated frames; the same commands give the same bytes.
+MODELS := default:hdl-64e hidden-8:hdl-64e-8 hdl-32e:hdl-32e vlp-32c:vlp-32c
 model: $(VENV)/.train
-	$(BIN)/upbeam train --recipe default --out quant/models/hdl-64e.ubm $(if $(SHARED),--evaluate $(SHARED)/kitti/frames)
-	$(BIN)/upbeam train --recipe hidden-8 --out quant/models/hdl-64e-8.ubm $(if $(SHARED),--evaluate $(SHARED)/kitti/frames)
-	$(BIN)/upbeam train --recipe hdl-32e --out quant/models/hdl-32e.ubm
-	$(BIN)/upbeam train --recipe vlp-32c --out quant/models/vlp-32c.ubm
+	@mkdir -p build/model
+	@set -e; for pair in $(MODELS); do recipe=$${pair%%:*}; name=$${pair##*:}; \
+		$(BIN)/upbeam train --recipe $$recipe --out build/model/$$name.ubm; \
+		cp build/model/$$name.csv quant/models/; \
+		$(BIN)/upbeam quantize build/model/$$name.ubm -o quant/models/$$name.ubm; done
 
 bench: test-c
 	build/c/tests/kernels/checkkernels --bench --model quant/models/hdl-64e.ubm
