@@ -14,22 +14,22 @@
 #define FUSED(a, b, c) ((a) * (b) + (c))
 #endif
 
-static float pick_valid(const upb_model_f32 *model, unsigned beam, uint16_t distance, float value) {
-    return (float)distance >= model->min_count && (float)distance <= model->seen_max[beam] ? value : 0.0f;
+static int is_seen(const upb_model_f32 *model, unsigned beam, uint16_t distance) {
+    return (float)distance >= model->min_count && (float)distance <= model->seen_max[beam];
 }
 
 static void prepare_f32_c(upb_prepared_f32 *prepared, const upb_model_f32 *model, const uint16_t *distance,
                           const uint8_t *intensity) {
-    float d[UPB_LANES + 1], i[UPB_LANES + 1];
+    uint16_t d[UPB_LANES + 1], i[UPB_LANES + 1];
     for (unsigned k = 0; k < UPB_LANES; k++) {
-        d[k] = pick_valid(model, k, distance[k], (float)distance[k]);
-        i[k] = pick_valid(model, k, distance[k], (float)intensity[k]);
+        d[k] = is_seen(model, k, distance[k]) ? distance[k] : 0;
+        i[k] = is_seen(model, k, distance[k]) ? intensity[k] : 0;
     }
-    d[UPB_LANES] = i[UPB_LANES] = 0.0f;
+    d[UPB_LANES] = i[UPB_LANES] = 0;
     for (unsigned k = 0; k < UPB_LANES; k++) {
         /* Intensities are filled in the same places as distances: a measured intensity may be 0. */
-        unsigned top = model->fill && d[k] == 0.0f ? k + 1 : k;
-        unsigned bottom = model->fill && d[k + 1] == 0.0f ? k : k + 1;
+        unsigned top = model->fill && d[k] == 0 ? k + 1 : k;
+        unsigned bottom = model->fill && d[k + 1] == 0 ? k : k + 1;
         prepared->row[UPB_DISTANCE_TOP][k] = d[top];
         prepared->row[UPB_DISTANCE_BOTTOM][k] = d[bottom];
         prepared->row[UPB_INTENSITY_TOP][k] = i[top];
@@ -57,7 +57,7 @@ static void gather(float x[UPB_TAPS], const upb_model_f32 *model, const upb_prep
     for (int c = 0; c < 3; c++) {
         x[c] = column[c]->row[first][k];
         x[3 + c] = column[c]->row[first + 1][k];
-        empty[c] = column[c]->row[UPB_DISTANCE_TOP][k] == 0.0f; /* the pair is filled: its top tells for both */
+        empty[c] = column[c]->row[UPB_DISTANCE_TOP][k] == 0; /* the pair is filled: its top tells for both */
     }
     if (model->fill) {
         fill_columns(x, empty);

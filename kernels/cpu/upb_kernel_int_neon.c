@@ -2,56 +2,16 @@
  * The integer window kernels with NEON, which every AArch64 has. UPB_DOT: the machine has the dot product instructions
  * too, which int8 takes.
  */
-#include <arm_neon.h>
-#include <stdint.h>
-#include <string.h>
+#include "upb_vectors_neon.h"
 
-#include "upb_kernels.h"
-
-#define V uint16x8_t
-#define M uint16x8_t
-#define V_LANES 8
-
-typedef struct wide {
-    int32x4_t half[2];
-} wide;
-
-#define W wide
-
-static inline W minus_1(W w) {
-    const int32x4_t one = vdupq_n_s32(1);
-    return (W){{vsubq_s32(w.half[0], one), vsubq_s32(w.half[1], one)}};
+/* Inputs and minimum stand shifted left by k. */
+static inline V window_minimum(const upb_network_int *net, const V x[UPB_TAPS]) {
+    return V_SHIFT_RIGHT(x[UPB_TAP_MINIMUM], net->k);
 }
 
-#define V_LOAD(p) vld1q_u16(p)
-#define V_LOADU(p) vld1q_u16(p)
-#define V_STORE(p, v) vst1q_u16(p, v)
-#define V_STOREU(p, v) vst1q_u16(p, v)
-#define V_LOAD_U8(p) vmovl_u8(vld1_u8(p))
-#define V_STORE_U8(p, v) vst1_u8(p, vmovn_u16(v))
-#define V_SET(x) vdupq_n_u16((uint16_t)(x))
-#define V_ADD_SAT(a, b) vqaddq_u16(a, b)
-#define V_SUB(a, b) vsubq_u16(a, b)
-#define V_AND(a, b) vandq_u16(a, b)
-#define V_OR(a, b) vorrq_u16(a, b)
-#define V_MIN(a, b) vminq_u16(a, b)
-#define V_MAX(a, b) vmaxq_u16(a, b)
-#define V_SHIFT_LEFT(v, n) vshlq_u16(v, vdupq_n_s16((int16_t)(n)))
-#define V_SHIFT_RIGHT(v, n) vshlq_u16(v, vdupq_n_s16((int16_t)(0 - (n))))
-#define V_NEXT(a, b) vextq_u16(a, b, 1)
-#define V_TOP_BIT(v) vshlq_u16(vdupq_n_u16(0x8000), vnegq_s16(vreinterpretq_s16_u16(vclzq_u16(v))))
-#define M_IS_ZERO(v) vceqzq_u16(v)
-#define M_AT_LEAST(a, b) vcgeq_u16(a, b)
-#define M_AND(m, n) vandq_u16(m, n)
-#define M_AND_NOT(m, n) vbicq_u16(m, n)
-#define V_SELECT(m, yes, no) vbslq_u16(m, yes, no)
-#define V_KEEP(m, v) vandq_u16(m, v)
-#define W_MINUS_1(w) minus_1(w)
-#define V_FROM_W(w) vqmovun_high_s32(vqmovun_s32((w).half[0]), (w).half[1])
-
 /* Unsigned becomes signed, 32768 less: the bias makes up for it. */
-static inline int16x8_t signed_less(uint16x8_t x, uint32_t shift) {
-    return vreinterpretq_s16_u16(veorq_u16(V_SHIFT_LEFT(x, shift), vdupq_n_u16(0x8000)));
+static inline int16x8_t signed_minimum(const upb_network_int *net, const V x[UPB_TAPS]) {
+    return vreinterpretq_s16_u16(veorq_u16(V_SHIFT_LEFT(window_minimum(net, x), net->j), vdupq_n_u16(0x8000)));
 }
 
 /* Steps 5 and 6 for one unit: bias and the upper half of its sum, rectifier. */
@@ -75,10 +35,8 @@ UPB_INLINE void add_units(W *output, int16x8_t a, int16x8_t b, const int16_t *pa
 /* Steps 8 and 9. */
 UPB_INLINE W finish_output(const upb_network_int *net, W output, V minimum) {
     const int32x4_t shift = vdupq_n_s32(-(int32_t)net->t);
-    const V added = vandq_u16(minimum, vdupq_n_u16(net->skip ? 0xffff : 0));
-    const int32x4_t low = vreinterpretq_s32_u32(vmovl_u16(vget_low_u16(added)));
-    const int32x4_t high = vreinterpretq_s32_u32(vmovl_high_u16(added));
-    return (W){{vaddq_s32(vshlq_s32(output.half[0], shift), low), vaddq_s32(vshlq_s32(output.half[1], shift), high)}};
+    const W rounded = {{vshlq_s32(output.half[0], shift), vshlq_s32(output.half[1], shift)}};
+    return W_ADD_V(rounded, vandq_u16(minimum, vdupq_n_u16(net->skip ? 0xffff : 0)));
 }
 
 #define ADD_TAP(sum, x, weights, i)                                                                                    \
@@ -104,8 +62,9 @@ typedef struct inputs {
 
 UPB_INLINE inputs signed_inputs(const upb_network_int *net, const V x[UPB_TAPS]) {
     inputs in;
-    for (int i = 0; i < UPB_TAPS; i++)
-        in.x[i] = signed_less(x[i], i == UPB_TAP_MINIMUM ? net->j : net->k);
+    for (int i = 0; i < UPB_TAP_MINIMUM; i++)
+        in.x[i] = vreinterpretq_s16_u16(x[i]);
+    in.x[UPB_TAP_MINIMUM] = signed_minimum(net, x);
     return in;
 }
 
@@ -123,12 +82,13 @@ UPB_INLINE W network_words(const upb_network_int *net, const inputs *in, V minim
 UPB_INLINE void networks_int16(W y[2], const upb_network_int networks[2], V x[2][UPB_TAPS]) {
     /* No loop: compilers leave it rolled, and then keep the inputs in memory. */
     const inputs distance = signed_inputs(&networks[0], x[0]), intensity = signed_inputs(&networks[1], x[1]);
-    y[0] = network_words(&networks[0], &distance, x[0][UPB_TAP_MINIMUM]);
-    y[1] = network_words(&networks[1], &intensity, x[1][UPB_TAP_MINIMUM]);
+    y[0] = network_words(&networks[0], &distance, window_minimum(&networks[0], x[0]));
+    y[1] = network_words(&networks[1], &intensity, window_minimum(&networks[1], x[1]));
 }
 
 #ifdef UPB_DOT
 #define HAS_NETWORKS_INT8
+static const uint16_t int8_lift[2]; /* none */
 #define UPB_FILL_KERNELS upb_kernels_fill_int_neon_dot
 
 /* Four windows: their codes less 128, as bytes (0, 1, 2, 3) and (4, 5, none, none) of 32 bits; the minimum; s + k. */
@@ -142,18 +102,18 @@ static inline int8x16_t less_128(uint16x8_t bytes) {
     return vreinterpretq_s8_u8(veorq_u8(vreinterpretq_u8_u16(bytes), vdupq_n_u8(0x80)));
 }
 
-/* Step 3. */
+/* Step 3. Inputs stand shifted left by k: their own shift s is larger by as much, or they have that many zeros. */
 UPB_INLINE void code(coded group[2], const upb_network_int *net, const V x[UPB_TAPS]) {
     const V any = V_OR(V_OR(V_OR(x[0], x[1]), V_OR(x[2], x[3])), V_OR(x[4], x[5])); /* as long as the largest */
     const uint16x8_t shift = vsubq_u16(vdupq_n_u16(16), vclzq_u16(vshrq_n_u16(any, 8)));
     const int16x8_t back = vnegq_s16(vreinterpretq_s16_u16(shift));
-    const uint16x8_t total = vaddq_u16(shift, vdupq_n_u16((uint16_t)net->k8));
+    const uint16x8_t total = vaddq_u16(shift, vdupq_n_u16((uint16_t)net->in_weights));
     V q[6];
     for (int i = 0; i < 6; i++)
         q[i] = vminq_u16(vrshlq_u16(x[i], back), vdupq_n_u16(255));
     const uint16x8_t q01 = vsliq_n_u16(q[0], q[1], 8), q23 = vsliq_n_u16(q[2], q[3], 8);
     const uint16x8_t q45 = vsliq_n_u16(q[4], q[5], 8);
-    const int16x8_t minimum = signed_less(x[UPB_TAP_MINIMUM], net->j);
+    const int16x8_t minimum = signed_minimum(net, x);
     group[0] = (coded){less_128(vzip1q_u16(q01, q23)), less_128(vzip1q_u16(q45, q45)), vget_low_s16(minimum),
                        vreinterpretq_s32_u32(vmovl_u16(vget_low_u16(total)))};
     group[1] = (coded){less_128(vzip2q_u16(q01, q23)), less_128(vzip2q_u16(q45, q45)), vget_high_s16(minimum),
@@ -189,8 +149,8 @@ UPB_INLINE void networks_int8(W y[2], const upb_network_int networks[2], V x[2][
     coded distance[2], intensity[2];
     code(distance, &networks[0], x[0]);
     code(intensity, &networks[1], x[1]);
-    y[0] = network_bytes(&networks[0], distance, x[0][UPB_TAP_MINIMUM]);
-    y[1] = network_bytes(&networks[1], intensity, x[1][UPB_TAP_MINIMUM]);
+    y[0] = network_bytes(&networks[0], distance, window_minimum(&networks[0], x[0]));
+    y[1] = network_bytes(&networks[1], intensity, window_minimum(&networks[1], x[1]));
 }
 
 #else

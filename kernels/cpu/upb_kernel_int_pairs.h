@@ -11,7 +11,7 @@
  *   I_DOT(sum, a, b)       sum + a.even * b.even + a.odd * b.odd, signed, modulo 2^32
  *   I_UPPER(a, b)          in each 32-bit lane the upper half of a, below that of b
  *   I_MAX, I_SCALE(a, b)   signed 16 bits; (a * b + 2^14) >> 15
- *   I_XOR, I_ADD32(a, b), I_SHIFT_RIGHT32(a, n): arithmetic
+ *   I_SHIFT_RIGHT32(a, n)  arithmetic
  */
 #include <string.h>
 
@@ -30,18 +30,19 @@ static inline I set_pair(const int16_t *p) {
     return I_SET32(two);
 }
 
+static inline V window_minimum(const upb_network_int *net, const V x[UPB_TAPS]) {
+    return net->k ? V_SHIFT_RIGHT(x[UPB_TAP_MINIMUM], net->k) : x[UPB_TAP_MINIMUM];
+}
+
 /* Unsigned becomes signed, 32768 less: bias_signed makes up for it. */
 UPB_INLINE inputs pair_inputs(const upb_network_int *net, const V x[UPB_TAPS]) {
-    const I sign = I_SET32((int)0x80008000u), zero = I_SET32(0);
-    I signed_x[2 * PAIRS];
+    const V least = window_minimum(net, x);
+    const V last = V_XOR(net->j ? V_SHIFT_LEFT(least, net->j) : least, V_SET(0x8000u));
     inputs in;
-    for (int i = 0; i < UPB_TAP_MINIMUM; i++)
-        signed_x[i] = I_XOR(V_SHIFT_LEFT(x[i], net->k), sign);
-    signed_x[UPB_TAP_MINIMUM] = I_XOR(V_SHIFT_LEFT(x[UPB_TAP_MINIMUM], net->j), sign);
-    signed_x[7] = zero;
     for (int p = 0; p < PAIRS; p++) {
-        in.pair[0][p] = I_UNPACK_LOW(signed_x[2 * p], signed_x[2 * p + 1]);
-        in.pair[1][p] = I_UNPACK_HIGH(signed_x[2 * p], signed_x[2 * p + 1]);
+        const V even = p == PAIRS - 1 ? last : x[2 * p], odd = p == PAIRS - 1 ? V_SET(0) : x[2 * p + 1];
+        in.pair[0][p] = I_UNPACK_LOW(even, odd);
+        in.pair[1][p] = I_UNPACK_HIGH(even, odd);
     }
     return in;
 }
@@ -54,30 +55,33 @@ UPB_INLINE I unit_sum(const upb_network_int *net, uint32_t h, const I pair[PAIRS
 }
 
 /* Steps 4 to 7 of HALVES halves from `first` on. */
-UPB_INLINE void layers(I *output, const upb_network_int *net, const inputs *in, int first) {
-    const I slope = I_SET32((int32_t)((uint32_t)net->slope * 0x10001u));
+UPB_INLINE void layers(I *output, const upb_network_int *net, const inputs *in, int first, int is_leaky) {
+    const I slope = I_SET32((int32_t)((uint32_t)net->slope * 0x10001u)), zero = I_SET32(0);
     for (int half = first; half < first + HALVES; half++)
         output[half] = I_SET32(net->offset);
     for (uint32_t h = 0; h < net->hidden; h += 2)
         for (int half = first; half < first + HALVES; half++) {
             const I hidden = I_UPPER(unit_sum(net, h, in->pair[half]), unit_sum(net, h + 1, in->pair[half]));
-            output[half] = I_DOT(output[half], I_MAX(hidden, I_SCALE(hidden, slope)), set_pair(&net->output[h]));
+            const I bent = is_leaky ? I_SCALE(hidden, slope) : zero;
+            output[half] = I_DOT(output[half], I_MAX(hidden, bent), set_pair(&net->output[h]));
         }
 }
 
 UPB_INLINE W network(const upb_network_int *net, const inputs *in, V minimum) {
-    const I zero = I_SET32(0), added = net->skip ? minimum : zero;
     W y;
     for (int half = 0; half < 2; half += HALVES)
-        layers(y.half, net, in, half);
-    y.half[0] = I_ADD32(I_SHIFT_RIGHT32(y.half[0], net->t), I_UNPACK_LOW(added, zero));
-    y.half[1] = I_ADD32(I_SHIFT_RIGHT32(y.half[1], net->t), I_UNPACK_HIGH(added, zero));
-    return y;
+        if (net->slope)
+            layers(y.half, net, in, half, 1);
+        else
+            layers(y.half, net, in, half, 0);
+    for (int half = 0; half < 2; half++)
+        y.half[half] = I_SHIFT_RIGHT32(y.half[half], net->t);
+    return W_ADD_V(y, net->skip ? minimum : V_SET(0));
 }
 
 UPB_INLINE void networks_int16(W y[2], const upb_network_int networks[2], V x[2][UPB_TAPS]) {
     /* No loop: compilers leave it rolled, and then keep the inputs in memory. */
     const inputs distance = pair_inputs(&networks[0], x[0]), intensity = pair_inputs(&networks[1], x[1]);
-    y[0] = network(&networks[0], &distance, x[0][UPB_TAP_MINIMUM]);
-    y[1] = network(&networks[1], &intensity, x[1][UPB_TAP_MINIMUM]);
+    y[0] = network(&networks[0], &distance, window_minimum(&networks[0], x[0]));
+    y[1] = network(&networks[1], &intensity, window_minimum(&networks[1], x[1]));
 }

@@ -61,11 +61,14 @@ enum { UPB_DISTANCE_TOP, UPB_DISTANCE_BOTTOM, UPB_INTENSITY_TOP, UPB_INTENSITY_B
 /*
  * A column as windows see it: range limits applied (a pixel outside is 0, distance and intensity), and under
  * UPB_EMPTY_FILL an empty pixel filled from the other one of its pair. Three of them side by side make the windows.
- * Distances are 0 (empty) or min_count..65535, intensities 0..255, all whole.
+ * Distances are 0 (empty) or min_count..65535, intensities 0..255, in integer networks shifted left as their kernels
+ * like; all 0 is an empty column. To be used with the model and the instruction set that it was prepared with.
  */
-typedef struct upb_prepared_f32 {
-    _Alignas(UPB_ALIGN) float row[UPB_PREPARED_ROWS][UPB_LANES];
-} upb_prepared_f32;
+typedef struct upb_prepared {
+    _Alignas(UPB_ALIGN) uint16_t row[UPB_PREPARED_ROWS][UPB_LANES];
+} upb_prepared;
+
+typedef upb_prepared upb_prepared_f32;
 
 /* distance: [UPB_BEAMS] counts, 0..65535; intensity: [UPB_BEAMS]; no alignment needed. */
 typedef void (*upb_prepare_f32_fn)(upb_prepared_f32 *prepared, const upb_model_f32 *model, const uint16_t *distance,
@@ -94,7 +97,7 @@ typedef void (*upb_raw_f32_fn)(const upb_model_f32 *model, const upb_prepared_f3
  *
  * In int8, W << min(k, 8) still fits 16 bits, and (q << s) << (k - 8) fits as well: `weight` and `k` are so, and an
  * int8 network is an int16 network of the codes q << s. Kernels that multiply bytes take `weight8` (eight bytes with
- * two zeros), `k8` and what belongs to them; in int16 these are 0.
+ * two zeros) with the shift `in_weights` that the others have in them, and what belongs to them; in int16 these are 0.
  *
  * `bias` includes the rounding of step 5, `offset` that of step 8. What is unsigned here, a kernel may take as signed,
  * 32768 less: `bias_signed` is the bias of one that does so with the inputs (shifted by k) and the minimum (by j),
@@ -112,7 +115,7 @@ typedef struct upb_network_int {
     int32_t offset;
     uint32_t hidden; /* even, 2..UPB_MAX_HIDDEN */
     uint32_t k, j, t;
-    uint32_t k8;
+    uint32_t in_weights;
     int32_t slope; /* 0..32767 */
     uint32_t skip; /* 0, 1 */
 } upb_network_int;
@@ -126,10 +129,7 @@ typedef struct upb_model_int {
     uint16_t fill;
 } upb_model_int;
 
-/* A column as windows see it, as upb_prepared_f32. */
-typedef struct upb_prepared_int {
-    _Alignas(UPB_ALIGN) uint16_t row[UPB_PREPARED_ROWS][UPB_LANES];
-} upb_prepared_int;
+typedef upb_prepared upb_prepared_int;
 
 typedef void (*upb_prepare_int_fn)(upb_prepared_int *prepared, const upb_model_int *model, const uint16_t *distance,
                                    const uint8_t *intensity);

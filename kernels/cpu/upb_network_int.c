@@ -46,7 +46,7 @@ void upb_network_int_finish(upb_network_int *net, upb_precision precision) {
         }
         net->bias_signed[h] = wrapped(net->bias[h], (uint32_t)sum * 32768u);
     }
-    net->k8 = is_int8 ? net->k : 0;
+    net->in_weights = in_weights;
     net->k -= in_weights;
 }
 

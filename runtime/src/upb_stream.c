@@ -7,6 +7,7 @@
  */
 #include <string.h>
 
+#include "upb_interleave.h"
 #include "upb_internal.h"
 
 #define ALL_BEAMS 0xffffffffu
@@ -47,8 +48,7 @@ struct upb_stream {
     upb_windows_int_fn windows_int; /* of the precision */
     const upb_model *model;
     const upb_model_int *integer; /* of the precision; null: float */
-    unsigned char *prepared;      /* [PREPARED_COLUMNS] upb_prepared_int if `integer`, else upb_prepared_f32 */
-    size_t prepared_bytes;        /* of each */
+    upb_prepared *prepared;       /* [PREPARED_COLUMNS] */
     upb_column_sink sink;
     void *user;
     uint32_t columns;
@@ -66,9 +66,11 @@ struct upb_stream {
     /* azimuth columns of this segment */
     place next;     /* the next one to complete */
     uint32_t spare; /* prepared column that the next one goes to */
-    const void *left, *middle;
-    uint32_t pending; /* `middle` waits for its right neighbour; its own rows lie in out_* already */
+    const upb_prepared *left, *middle;
+    uint32_t pending; /* `middle` waits for its right neighbour, and own_* are its rows */
     uint32_t pending_flags;
+    uint16_t own_distance[UPB_BEAMS];
+    uint8_t own_intensity[UPB_BEAMS];
     place pending_place;
 };
 
@@ -115,11 +117,6 @@ static destagger plan_destagger(const upb_model_info *info, const upb_stream_con
     for (unsigned k = 0; k < UPB_BEAMS; k++)
         plan.beam_slot[k] = (uint16_t)(offset[k] - least);
     return plan;
-}
-
-/* Prepared columns of a precision. */
-static size_t prepared_bytes(uint32_t precision) {
-    return precision == UPB_PRECISION_FP32 ? sizeof(upb_prepared_f32) : sizeof(upb_prepared_int);
 }
 
 static size_t ring_bytes(const destagger *plan) { return plan->slots > 1 ? plan->slots * sizeof(ring_slot) : 0; }
@@ -175,7 +172,7 @@ upb_status upb_stream_bytes(const upb_model *model, const upb_stream_config *con
     if (!bytes)
         return bad_argument(error, "bytes", 0, 0);
     const destagger plan = plan_destagger(&model->info, config);
-    *bytes = sizeof(upb_stream) + PREPARED_COLUMNS * prepared_bytes(config->precision) + ring_bytes(&plan);
+    *bytes = sizeof(upb_stream) + PREPARED_COLUMNS * sizeof(upb_prepared) + ring_bytes(&plan);
     return UPB_OK;
 }
 
@@ -197,9 +194,7 @@ upb_status upb_stream_sizes(const upb_model *model, const upb_stream_config *con
     return UPB_OK;
 }
 
-static const void *empty_column(const upb_stream *stream) {
-    return stream->prepared + EMPTY_COLUMN * stream->prepared_bytes;
-}
+static const upb_prepared *empty_column(const upb_stream *stream) { return &stream->prepared[EMPTY_COLUMN]; }
 
 /* Begins a segment whose columns will be numbered from `frame` on. */
 static void begin_segment(upb_stream *stream, uint64_t frame) {
@@ -244,9 +239,8 @@ upb_status upb_stream_init(void *memory, size_t memory_bytes, const upb_model *m
     if (s->reorder_columns > s->columns / 2)
         s->reorder_columns = s->columns / 2;
     s->beams = plan_destagger(&model->info, config);
-    s->prepared = (unsigned char *)(s + 1);
-    s->prepared_bytes = prepared_bytes(config->precision);
-    s->ring = s->beams.slots > 1 ? (ring_slot *)(void *)(s->prepared + PREPARED_COLUMNS * s->prepared_bytes) : NULL;
+    s->prepared = (upb_prepared *)(s + 1);
+    s->ring = s->beams.slots > 1 ? (ring_slot *)(s->prepared + PREPARED_COLUMNS) : NULL;
     choose_kernels(s, config);
     s->stats.precision = config->precision;
     s->stats.delay_columns = s->beams.delay + 1;
@@ -278,14 +272,14 @@ upb_status upb_stream_get_stats(const upb_stream *stream, upb_stream_stats *stat
 
 /* -------------------------------------------------------------------------------------- azimuth columns */
 
-static void prepare(const upb_stream *s, void *prepared, const uint16_t *distance, const uint8_t *intensity) {
+static void prepare(const upb_stream *s, upb_prepared *prepared, const uint16_t *distance, const uint8_t *intensity) {
     if (s->integer)
         s->prepare_int(prepared, s->integer, distance, intensity);
     else
         s->prepare_f32(prepared, &s->model->f32, distance, intensity);
 }
 
-static void make_windows(const upb_stream *s, const void *right, uint16_t *distance, uint8_t *intensity) {
+static void make_windows(const upb_stream *s, const upb_prepared *right, uint16_t *distance, uint8_t *intensity) {
     if (s->integer)
         s->windows_int(s->integer, s->left, s->middle, right, distance, intensity);
     else
@@ -293,17 +287,15 @@ static void make_windows(const upb_stream *s, const void *right, uint16_t *dista
 }
 
 /* Finishes the pending column between its neighbours and hands it out. */
-static void finish(upb_stream *s, const void *right) {
+static void finish(upb_stream *s, const upb_prepared *right) {
     uint16_t distance[UPB_LANES];
     uint8_t intensity[UPB_LANES];
     make_windows(s, right, distance, intensity);
-    for (unsigned k = 0; k < UPB_WINDOWS; k++) {
-        s->out_distance[2 * k + 1] = distance[k];
-        s->out_intensity[2 * k + 1] = intensity[k];
-    }
+    interleave_rows(UPB_BEAMS, s->out_distance, s->out_intensity, s->own_distance, s->own_intensity, distance,
+                    intensity);
     const int repeat = s->model->info.last_row == UPB_LAST_ROW_REPEAT;
-    s->out_distance[UPB_ROWS - 1] = repeat ? s->out_distance[UPB_ROWS - 2] : 0;
-    s->out_intensity[UPB_ROWS - 1] = repeat ? s->out_intensity[UPB_ROWS - 2] : 0;
+    s->out_distance[UPB_ROWS - 1] = repeat ? s->own_distance[UPB_BEAMS - 1] : 0;
+    s->out_intensity[UPB_ROWS - 1] = repeat ? s->own_intensity[UPB_BEAMS - 1] : 0;
     s->pending = 0;
     s->stats.columns_out++;
     s->stats.frames_out += (s->pending_flags & UPB_COLUMN_LAST) != 0;
@@ -315,12 +307,10 @@ static void finish(upb_stream *s, const void *right) {
 }
 
 /* Makes the column just prepared the pending one. Its own rows leave as they came. */
-static void keep_pending(upb_stream *s, const void *prepared, const uint16_t *distance, const uint8_t *intensity,
-                         int complete) {
-    for (unsigned k = 0; k < UPB_BEAMS; k++) {
-        s->out_distance[2 * k] = distance[k];
-        s->out_intensity[2 * k] = intensity[k];
-    }
+static void keep_pending(upb_stream *s, const upb_prepared *prepared, const uint16_t *distance,
+                         const uint8_t *intensity, int complete) {
+    memcpy(s->own_distance, distance, sizeof s->own_distance);
+    memcpy(s->own_intensity, intensity, sizeof s->own_intensity);
     s->middle = prepared;
     s->pending = 1;
     s->pending_place = s->next;
@@ -330,7 +320,7 @@ static void keep_pending(upb_stream *s, const void *prepared, const uint16_t *di
 
 /* Takes the next azimuth column of the segment. */
 static void take_azimuth_column(upb_stream *s, const uint16_t *distance, const uint8_t *intensity, int complete) {
-    void *prepared = s->prepared + s->spare * s->prepared_bytes;
+    upb_prepared *prepared = &s->prepared[s->spare];
     s->spare = s->spare + 1 == EMPTY_COLUMN ? 0 : s->spare + 1;
     prepare(s, prepared, distance, intensity);
     if (s->pending) {

@@ -34,7 +34,9 @@ def bench(
         str | None, typer.Option(help="A .ubm file or a shipped model's name; hdl-64e if omitted.")
     ] = None,
     frames: Annotated[str, typer.Option(help="'sim', a KITTI .bin file, or a capture; its first frame.")] = SIMULATED,
-    threads: Annotated[str, typer.Option(help="Numbers of threads, with commas; 1 must be there.")] = "1,2",
+    threads: Annotated[
+        str | None, typer.Option(help="Numbers of threads, with commas, 1 among them; 1,2 if omitted, 1 if --quick.")
+    ] = None,
     peers: Annotated[str, typer.Option(help=f"'all', 'none', or of {', '.join(PEERS)}, with commas.")] = "all",
     columns: Annotated[str, typer.Option(help="Widths to show the cost of, with commas.")] = "512,1024,2048,4096,8192",
     quick: Annotated[bool, typer.Option(help="A few repetitions: shows that all works, not how fast.")] = False,
@@ -48,7 +50,7 @@ def bench(
     if devices:
         _show_devices(as_json)
         return
-    settings = _settings(threads, peers, columns, quick)
+    settings = _settings(threads or ("1" if quick else "1,2"), peers, columns, quick)
     loaded = load_model(model)
     frame = _frame(frames, loaded, quiet=as_json)
     with err.status("measuring ...") as status:
@@ -62,7 +64,7 @@ def bench(
         for part in tables(run):
             show(table(part.title, part.columns, part.rows))
             if part.note:
-                message(part.note)
+                show(f"{part.note}\n")
     for text in (*(f"{PEERS[k].title}: missing, {v}" for k, v in run.missing.items()), *run.notes, NOTE):
         message(text)
 
