@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-NATIVE := CMakeLists.txt $(shell find kernels/cpu runtime -name '*.[ch]' -o -name '*.cpp' -o -name 'CMakeLists.txt')
+NATIVE := CMakeLists.txt $(shell find kernels/cpu runtime power/bench -name '*.[ch]' -o -name '*.cpp' -o -name 'CMakeLists.txt')
 SHELL  := bash
 SHARED := $(firstword $(wildcard ../shared/data))
 
@@ -16,7 +16,7 @@ help:
 	@echo "make test-train  the tests that need PyTorch"
 	@echo "make setup       build .venv; the command line is then $(BIN)/upbeam"
 	@echo "make lint        style and types"
-	@echo "make bench       kernel tests and benchmarks"
+	@echo "make bench       kernels beside their bound, compilers and other runtimes (minutes)"
 	@echo "make soak        the long runs (about 15 minutes)"
 	@echo "make model       train and quantise the shipped models anew"
 	@echo "make accuracy    every method beside every other (trains what is not shipped: half an hour)"
@@ -90,8 +90,14 @@ model: $(VENV)/.train
 		cp build/model/$$name.csv quant/models/; \
 		$(BIN)/upbeam quantize build/model/$$name.ubm -o quant/models/$$name.ubm; done
 
-bench: test-c
+$(VENV)/.bench: $(VENV)/.dev
+	@echo "== installing the peers of the benchmark"
+	@$(PIP) --no-build-isolation --editable ".[dev,bench]"
+	@touch $@
+
+bench: test-c $(VENV)/.bench
 	build/c/tests/kernels/checkkernels --bench --model quant/models/hdl-64e.ubm
+	$(BIN)/upbeam bench --report build/bench
 
 # What takes minutes: a ten-minute stream in real time, a million damaged model files, more random scenarios.
 soak: test-c $(VENV)/.dev

@@ -10,7 +10,7 @@ import typer
 import upbeam
 from upbeam.kernels.opencl import OpenClError
 
-from . import doctor, evaluate, export, inspect, ops, quantize, simulate, stream, train, upsample, verify
+from . import bench, doctor, evaluate, export, inspect, ops, quantize, simulate, stream, train, upsample, verify
 from .common import message
 
 __all__ = ["app", "run"]
@@ -32,6 +32,7 @@ app.command("quantize")(quantize.quantize)
 app.command("verify")(verify.verify)
 app.command("export")(export.export)
 app.command("inspect")(inspect.inspect)
+app.command("bench")(bench.bench)
 app.command("doctor")(doctor.doctor)
 
 
