@@ -82,7 +82,7 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports
 
 # Networks are trained, then quantised on simulated frames; the same commands give the same bytes.
-MODELS := default:hdl-64e hidden-8:hdl-64e-8 hdl-32e:hdl-32e vlp-32c:vlp-32c
+MODELS := default:hdl-64e hidden-8:hdl-64e-8 hidden-6:hdl-64e-6 hdl-32e:hdl-32e vlp-32c:vlp-32c
 model: $(VENV)/.train
 	@mkdir -p build/model
 	@set -e; for pair in $(MODELS); do recipe=$${pair%%:*}; name=$${pair##*:}; \
