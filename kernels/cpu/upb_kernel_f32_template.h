@@ -42,17 +42,19 @@ UPB_INLINE void layers(F y[2], const upb_network_f32 *net, const V x[UPB_TAPS], 
         in[1][i] = F_HIGH(x[i]);
     }
     y[0] = y[1] = F_SET(net->offset);
-    for (uint32_t h = 0; h < net->hidden; h++) {
-        const float *unit = net->unit[h];
-        F sum[2];
-        sum[0] = sum[1] = F_SET(unit[UPB_UNIT_BIAS]);
+    for (uint32_t h = 0; h < net->hidden; h += 2) { /* two, so that there is work between dependent steps */
+        F sum[2][2];
+        for (unsigned u = 0; u < 2; u++)
+            sum[u][0] = sum[u][1] = F_SET(net->unit[h + u][UPB_UNIT_BIAS]);
         for (int i = 0; i < UPB_TAPS; i++)
-            for (int half = 0; half < 2; half++)
-                sum[half] = F_FMA(F_SET(unit[i]), in[half][i], sum[half]);
-        for (int half = 0; half < 2; half++) {
-            const F bent = is_leaky ? F_MUL(slope, sum[half]) : zero;
-            y[half] = F_FMA(F_SET(unit[UPB_UNIT_OUTPUT]), F_MAX(sum[half], bent), y[half]);
-        }
+            for (unsigned u = 0; u < 2; u++)
+                for (int half = 0; half < 2; half++)
+                    sum[u][half] = F_FMA(F_SET(net->unit[h + u][i]), in[half][i], sum[u][half]);
+        for (unsigned u = 0; u < 2; u++)
+            for (int half = 0; half < 2; half++) {
+                const F bent = is_leaky ? F_MUL(slope, sum[u][half]) : zero;
+                y[half] = F_FMA(F_SET(net->unit[h + u][UPB_UNIT_OUTPUT]), F_MAX(sum[u][half], bent), y[half]);
+            }
     }
 }
 

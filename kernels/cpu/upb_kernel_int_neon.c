@@ -15,10 +15,10 @@ static inline int16x8_t signed_minimum(const upb_network_int *net, const V x[UPB
 }
 
 /* Steps 5 and 6 for one unit: bias and the upper half of its sum, rectifier. */
-UPB_INLINE int16x8_t rectified(W sum, const int32_t *bias, int16_t slope) {
+UPB_INLINE int16x8_t rectified(W sum, const int32_t *bias, int32_t slope) {
     const int32x4_t added = vld1q_dup_s32(bias);
     const int16x8_t hidden = vaddhn_high_s32(vaddhn_s32(sum.half[0], added), sum.half[1], added);
-    return vmaxq_s16(hidden, vqrdmulhq_n_s16(hidden, slope));
+    return vmaxq_s16(hidden, slope ? vqrdmulhq_n_s16(hidden, (int16_t)slope) : vdupq_n_s16(0));
 }
 
 /* Step 7 for two units; `pair`: their output weights. */
@@ -68,15 +68,18 @@ UPB_INLINE inputs signed_inputs(const upb_network_int *net, const V x[UPB_TAPS])
     return in;
 }
 
-UPB_INLINE W network_words(const upb_network_int *net, const inputs *in, V minimum) {
-    const int16_t slope = (int16_t)net->slope;
+UPB_INLINE W layers_words(const upb_network_int *net, const inputs *in, int32_t slope) {
     W output = {{vdupq_n_s32(net->offset), vdupq_n_s32(net->offset)}};
     for (uint32_t h = 0; h < net->hidden; h += 2) { /* two, so that an in-order core has work between dependent steps */
         const W a = unit_sum(net->weight[h], in->x), b = unit_sum(net->weight[h + 1], in->x);
         add_units(&output, rectified(a, &net->bias_signed[h], slope), rectified(b, &net->bias_signed[h + 1], slope),
                   &net->output[h]);
     }
-    return finish_output(net, output, minimum);
+    return output;
+}
+
+UPB_INLINE W network_words(const upb_network_int *net, const inputs *in, V minimum) {
+    return finish_output(net, net->slope ? layers_words(net, in, net->slope) : layers_words(net, in, 0), minimum);
 }
 
 UPB_INLINE void networks_int16(W y[2], const upb_network_int networks[2], V x[2][UPB_TAPS]) {
@@ -134,15 +137,18 @@ UPB_INLINE W unit_sum_bytes(const upb_network_int *net, uint32_t h, const coded 
     return sum;
 }
 
-UPB_INLINE W network_bytes(const upb_network_int *net, const coded group[2], V minimum) {
-    const int16_t slope = (int16_t)net->slope;
+UPB_INLINE W layers_bytes(const upb_network_int *net, const coded group[2], int32_t slope) {
     W output = {{vdupq_n_s32(net->offset), vdupq_n_s32(net->offset)}};
     for (uint32_t h = 0; h < net->hidden; h += 2) {
         const W a = unit_sum_bytes(net, h, group), b = unit_sum_bytes(net, h + 1, group);
         add_units(&output, rectified(a, &net->bias8[h], slope), rectified(b, &net->bias8[h + 1], slope),
                   &net->output[h]);
     }
-    return finish_output(net, output, minimum);
+    return output;
+}
+
+UPB_INLINE W network_bytes(const upb_network_int *net, const coded group[2], V minimum) {
+    return finish_output(net, net->slope ? layers_bytes(net, group, net->slope) : layers_bytes(net, group, 0), minimum);
 }
 
 UPB_INLINE void networks_int8(W y[2], const upb_network_int networks[2], V x[2][UPB_TAPS]) {

@@ -32,8 +32,9 @@ enum { UPB_UNIT_BIAS = UPB_TAPS, UPB_UNIT_OUTPUT = UPB_TAPS + 1, UPB_UNIT_FLOATS
 
 /*
  * One network, folded: y = offset + sum over h of OUTPUT[h] * leaky(BIAS[h] + sum over i of unit[h][i] * x[i]) + skip *
- * min, in this order. One hidden unit is one cache line: seven weights, bias, output weight, zeros. Values: finite,
- * magnitudes below 1e11; slope 0..1. Inputs are at most 65535, so that no sum overflows.
+ * min, in this order. One hidden unit is one cache line: seven weights, bias, output weight, zeros. Units from `hidden`
+ * on are zeros, so that kernels may take two at a time. Values: finite, magnitudes below 1e11; slope 0..1. Inputs are
+ * at most 65535, so that no sum overflows.
  */
 typedef struct upb_network_f32 {
     _Alignas(UPB_ALIGN) float unit[UPB_MAX_HIDDEN][UPB_UNIT_FLOATS];

@@ -23,10 +23,14 @@ typedef struct ring_slot {
 
 /* How azimuth offsets become a ring. */
 typedef struct destagger {
-    int32_t shift;                 /* azimuth column of firing column j: j + shift + (0 at beam_slot = delay) */
-    uint32_t slots;                /* azimuth columns that fill at the same time; 1: no ring is needed */
-    uint32_t delay;                /* firing columns from a column to its last beam */
-    uint16_t beam_slot[UPB_BEAMS]; /* slots ahead of the oldest one */
+    int32_t shift;  /* azimuth column of firing column j: j + shift + (0 at beam_slot = delay) */
+    uint32_t slots; /* azimuth columns that fill at the same time; 1: no ring is needed */
+    uint32_t delay; /* firing columns from a column to its last beam */
+    /* Beams of the same offset go to the same slot: */
+    uint32_t groups;
+    uint32_t group_beams[UPB_BEAMS]; /* bit k: beam k */
+    uint16_t group_slot[UPB_BEAMS];  /* slots ahead of the oldest one */
+    uint8_t beam_group[UPB_BEAMS];
 } destagger;
 
 /* Place of an azimuth column. */
@@ -98,13 +102,23 @@ static uint32_t columns_of(const upb_model_info *info, const upb_stream_config *
     return config->columns ? config->columns : info->columns;
 }
 
+static void add_beam(destagger *plan, unsigned beam, uint16_t slot) {
+    uint32_t group = 0;
+    while (group < plan->groups && plan->group_slot[group] != slot)
+        group++;
+    if (group == plan->groups)
+        plan->group_slot[plan->groups++] = slot;
+    plan->group_beams[group] |= 1u << beam;
+    plan->beam_group[beam] = (uint8_t)group;
+}
+
 /*
  * Offsets that are all of one sign only rename the columns: what they have in common is `shift`, what remains reaches
  * from -delay to slots - 1 - delay around 0.
  */
 static destagger plan_destagger(const upb_model_info *info, const upb_stream_config *config) {
     const uint32_t columns = columns_of(info, config);
-    destagger plan;
+    destagger plan = {0};
     int32_t offset[UPB_BEAMS], least = INT32_MAX, most = INT32_MIN;
     for (unsigned k = 0; k < UPB_BEAMS; k++) {
         offset[k] = config->aligned ? 0 : upb_offset_columns(info->azimuth_offset_udeg[k], columns);
@@ -115,7 +129,7 @@ static destagger plan_destagger(const upb_model_info *info, const upb_stream_con
     plan.slots = (uint32_t)(most - least) + 1;
     plan.delay = (uint32_t)(plan.shift - least);
     for (unsigned k = 0; k < UPB_BEAMS; k++)
-        plan.beam_slot[k] = (uint16_t)(offset[k] - least);
+        add_beam(&plan, k, (uint16_t)(offset[k] - least));
     return plan;
 }
 
@@ -354,12 +368,16 @@ static void complete_slot(upb_stream *s) {
 
 static void scatter(upb_stream *s, const uint16_t *distance, const uint8_t *intensity) {
     const uint32_t slots = s->beams.slots;
+    ring_slot *to[UPB_BEAMS];
+    for (uint32_t g = 0; g < s->beams.groups; g++) {
+        const uint32_t index = s->oldest + s->beams.group_slot[g];
+        to[g] = &s->ring[index < slots ? index : index - slots];
+        to[g]->arrived |= s->beams.group_beams[g];
+    }
     for (unsigned k = 0; k < UPB_BEAMS; k++) {
-        uint32_t index = s->oldest + s->beams.beam_slot[k];
-        ring_slot *slot = &s->ring[index < slots ? index : index - slots];
+        ring_slot *slot = to[s->beams.beam_group[k]];
         slot->distance[k] = distance[k];
         slot->intensity[k] = intensity[k];
-        slot->arrived |= 1u << k;
     }
 }
 

@@ -41,9 +41,7 @@ typedef struct parameters {
 } parameters;
 
 /* Of everything, and of the trained model on scenes. */
-static struct {
-    unsigned long long windows, flips;
-} all, scenes;
+static struct { unsigned long long windows, flips; } all, scenes;
 
 /* ------------------------------------------------------------------------------------------------ inputs */
 
@@ -330,11 +328,22 @@ static void use_column(void *user, const upb_column *column) {
     column_sum += column->distance[1];
 }
 
+/* Seconds of each push, sorted: from a column's counts to the finished column before it, in the sink. */
+static void report_latency(const char *cpu_name, const char *precision, double *seconds) {
+    const size_t pushes = (size_t)BENCH_RUNS * BENCH_COLUMNS;
+    qsort(seconds, pushes, sizeof seconds[0], compare_doubles);
+    printf("%-7s latency %-6s %8.1f %8.1f %8.1f ns for a push (p50, p99.9, max of %zu; measured, reading the clock "
+           "included)\n",
+           cpu_name, precision, seconds[pushes / 2] * 1e9, seconds[pushes - pushes / 1000] * 1e9,
+           seconds[pushes - 1] * 1e9, pushes);
+}
+
 /* The whole step of a stream: destagger ring, both networks, interleaving, sink; and the same as whole frames. */
 static void bench_stream(upb_cpu cpu, upb_precision precision, const upb_model *model, const raw_column *columns) {
     static _Alignas(UPB_ALIGN) unsigned char memory[1 << 18];
     static uint16_t in_d[UPB_BEAMS][BENCH_COLUMNS], out_d[UPB_ROWS][BENCH_COLUMNS];
     static uint8_t in_i[UPB_BEAMS][BENCH_COLUMNS], out_i[UPB_ROWS][BENCH_COLUMNS];
+    static double push[BENCH_RUNS * BENCH_COLUMNS];
     double pushed[BENCH_RUNS], framed[BENCH_RUNS];
     uint32_t written;
     upb_stream *stream;
@@ -359,11 +368,18 @@ static void bench_stream(upb_cpu cpu, upb_precision precision, const upb_model *
                          BENCH_COLUMNS, BENCH_COLUMNS, &written);
         framed[i] = seconds_now() - start;
     }
+    for (unsigned i = 0; i < BENCH_RUNS; i++)
+        for (unsigned c = 0; c < BENCH_COLUMNS; c++) {
+            const double start = seconds_now();
+            upb_stream_push(stream, c, columns[c].distance, columns[c].intensity);
+            push[i * BENCH_COLUMNS + c] = seconds_now() - start;
+        }
     upb_stream_stats stats;
     upb_stream_get_stats(stream, &stats);
     CHECK(stats.columns_late == 0 && stats.columns_missing == 0 && written == BENCH_COLUMNS);
     report(cpu_names[cpu], "push", precision_names[precision], pushed);
     report(cpu_names[cpu], "frame", precision_names[precision], framed);
+    report_latency(cpu_names[cpu], precision_names[precision], push);
 }
 
 static void choose_models(bench_models *models, const upb_model *trained, random_source *random) {

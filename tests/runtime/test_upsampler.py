@@ -284,7 +284,14 @@ def test_models_that_cannot_be_loaded(tmp_path):
         upbeam.load_model(tmp_path / "flipped.ubm")
 
 
-RECIPES = {"hdl-64e": "default", "hdl-64e-8": "hidden-8", "hdl-32e": "hdl-32e", "vlp-32c": "vlp-32c"}
+RECIPES = {
+    "hdl-64e": "default",
+    "hdl-64e-6": "hidden-6",
+    "hdl-64e-8": "hidden-8",
+    "hdl-32e": "hdl-32e",
+    "vlp-32c": "vlp-32c",
+}
+MULTIPLY_ADDS = {"hdl-64e-6": 48, "hdl-64e-8": 64}
 
 
 @pytest.mark.parametrize("name", list(RECIPES))
@@ -300,11 +307,11 @@ def test_shipped_models_are_what_their_recipes_make(name):
     assert model.rules.azimuth_offset_deg == pytest.approx(rules.azimuth_offset_deg, abs=1e-6)
     assert model.file.provenance["recipe"] == recipe.name
     assert model.file.provenance["licence"] == "Apache-2.0"
-    assert [n.multiply_adds for n in model.file.folded] == [64 if name == "hdl-64e-8" else 96] * 2
+    assert [n.multiply_adds for n in model.file.folded] == [MULTIPLY_ADDS.get(name, 96)] * 2
 
 
 def test_unknown_model_names_are_listed():
-    with pytest.raises(ValueError, match="no such model; shipped are hdl-32e, hdl-64e, hdl-64e-8, vlp-32c"):
+    with pytest.raises(ValueError, match="no such model; shipped are hdl-32e, hdl-64e, hdl-64e-6, hdl-64e-8, vlp-32c"):
         upbeam.load_model("hdl-128")
 
 
