@@ -41,7 +41,9 @@ typedef struct parameters {
 } parameters;
 
 /* Of everything, and of the trained model on scenes. */
-static struct { unsigned long long windows, flips; } all, scenes;
+static struct {
+    unsigned long long windows, flips;
+} all, scenes;
 
 /* ------------------------------------------------------------------------------------------------ inputs */
 
