@@ -126,3 +126,17 @@ def test_links_of_the_documents_exist():
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
             if "://" not in target:
                 assert (page.parent / target).exists(), f"{page.name} links to {target}, which does not exist"
+
+
+def test_memory_figures_are_those_of_the_library():
+    """One source: what the C library says. Python, the README and the model file agree with it."""
+    model = upbeam.load_model()
+    (row,) = [
+        line for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines() if "| memory, bytes |" in line
+    ]
+    sizes = {precision: model.sizes(precision) for precision in model.precisions}
+    assert f"model file {len(model.data):,};" in row
+    for precision, size in sizes.items():
+        assert f"{size['weights']} ({precision})" in row
+    assert f"state of a stream {sizes['int8']['state']:,} without" in row
+    assert {size["file"] for size in sizes.values()} == {len(model.data)}
