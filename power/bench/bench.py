@@ -18,7 +18,7 @@ from upbeam.quant.ubm import ModelFile
 from upbeam.runtime.upsampler import Model
 
 from .contest import Candidate, Entry, alternate
-from .machine import Peaks, measure_peaks
+from .machine import Peaks, measure_peaks, unit_pairs
 from .ours import ColumnLatency, Width, column_latency, fastest_cpu, kernel_candidates, usable_cpus, widths
 from .peers import PEERS, PeerPool, missing_peers
 from .plain import build_all, plain_candidate
@@ -174,8 +174,8 @@ def benchmark(
     work, notes = make_work(file, frame)
     model = Model(work.ubm)
     advance("the machine")
-    units = sum(net.hidden for net in work.file.folded)
-    run = Benchmark(work, fastest_cpu(model), settings, measure_peaks(units, repeats=settings.repeats), notes=notes)
+    peaks = measure_peaks(unit_pairs(work.file.folded), repeats=settings.repeats)
+    run = Benchmark(work, fastest_cpu(model), settings, peaks, notes=notes)
     run.missing = missing_peers(settings.peers)
     with tempfile.TemporaryDirectory() as folder, PeerPool(work, quick=settings.quick) as pool:
         candidates = _our_candidates(run, model)

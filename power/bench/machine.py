@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from upbeam.model.network import FoldedNetwork
+
 from . import _native
 
-__all__ = ["PEAK_OF", "Bound", "Peak", "Peaks", "measure_peaks"]
+__all__ = ["PEAK_OF", "Bound", "Peak", "Peaks", "measure_peaks", "unit_pairs"]
 
 PEAK_OF = {"fp32": "fma_f32", "int16": "dot_int16", "int8": "dot_int16"}
 """Kind of loop that a precision is compared with: int8 kernels multiply 16-bit pairs as well (docs/performance.md)."""
@@ -75,8 +78,17 @@ class Peaks:
         }
 
 
-def measure_peaks(hidden_units: int, *, repeats: int = 15) -> Peaks:
-    """``hidden_units``: of both networks together, for the port bounds. Takes some tens of milliseconds a loop."""
+def unit_pairs(networks: Iterable[FoldedNetwork]) -> tuple[int, int]:
+    """Pairs of hidden units without and with a slope: kernels take two at a time, the last with zeros if need be."""
+    plain = leaky = 0
+    for network in networks:
+        pairs = -(-network.hidden // 2)
+        plain, leaky = (plain, leaky + pairs) if network.slope > 0 else (plain + pairs, leaky)
+    return plain, leaky
+
+
+def measure_peaks(pairs: tuple[int, int], *, repeats: int = 15) -> Peaks:
+    """``pairs``: of ``unit_pairs``, for the port bounds. Takes some tens of milliseconds a loop."""
     loops = _native.loop_names()
     peaks = tuple(
         Peak(isa, kind, per_round / _native.loop_ns(isa, kind, 4096, repeats))
@@ -86,17 +98,22 @@ def measure_peaks(hidden_units: int, *, repeats: int = 15) -> Peaks:
     return Peaks(
         clock_ghz=_native.clock_ghz(repeats),
         peaks=peaks,
-        bounds=tuple(_bound(mix, hidden_units, repeats) for mix in _native.mixes()),
+        bounds=tuple(_bound(mix, pairs, repeats) for mix in _native.mixes()),
         load_gb_s=_loads(loops, repeats),
         copy_gb_s=_copy(-(-repeats // 3)),
     )
 
 
-def _bound(mix: dict[str, Any], units: int, repeats: int) -> Bound:
+def _bound(mix: dict[str, Any], pairs: tuple[int, int], repeats: int) -> Bound:
+    plain, leaky = pairs
     blocks = 32 / mix["windows"]
-    kinds = {**mix["unit"], **mix["rest"]}
-    counts = {k: blocks * (units * mix["unit"].get(k, 0) + mix["rest"].get(k, 0)) for k in kinds}
-    ns = blocks * _native.mix_ns(mix["isa"], mix["precision"], units, repeats)
+    parts = [(plain + leaky, mix["pair"]), (leaky, mix["leaky"]), (1, mix["rest"])]
+    counts: dict[str, float] = {}
+    for times, part in parts:
+        for kind, count in part.items():
+            if times:
+                counts[kind] = counts.get(kind, 0.0) + blocks * times * count
+    ns = blocks * _native.mix_ns(mix["isa"], mix["precision"], plain, leaky, repeats)
     return Bound(mix["isa"], mix["precision"], ns, counts)
 
 

@@ -152,21 +152,23 @@ def test_a_job_refuses_what_cannot_be(work: Work) -> None:
 def test_loops_count_what_they_run() -> None:
     for mix in _native.mixes():
         assert mix["windows"] in (8, 16, 32)
-        assert mix["unit"]["multiply_add"] >= 8
+        assert mix["pair"]["multiply_add"] >= 16
+        assert set(mix["leaky"]) == {"multiply"}
         assert set(mix["rest"]) <= {
             "multiply_add", "add", "minmax", "compare", "blend", "logic", "shift", "convert", "shuffle", "load",
             "store",
         }  # fmt: skip
-        least, most = (min(_native.mix_ns(mix["isa"], mix["precision"], n, 1) for _ in range(3)) for n in (4, 400))
-        assert 0 < least < most
+        for pairs in [((2, 0), (200, 0)), ((0, 2), (0, 200))]:
+            few, many = (min(_native.mix_ns(mix["isa"], mix["precision"], *n, 1) for _ in range(3)) for n in pairs)
+            assert 0 < few < many
     with pytest.raises(ValueError, match="no loop"):
         _native.loop_ns("avx2", "nonsense")
     with pytest.raises(ValueError, match="no mix"):
-        _native.mix_ns("nonsense", "fp32", 4)
+        _native.mix_ns("nonsense", "fp32", 4, 0)
 
 
 def test_peaks_have_a_clock_and_all_precisions() -> None:
-    peaks = measure_peaks(24, repeats=1)
+    peaks = measure_peaks((12, 0), repeats=1)
     assert peaks.clock_ghz > 0
     if _native.loop_names():
         for precision in ("fp32", "int16", "int8"):

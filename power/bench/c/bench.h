@@ -30,7 +30,7 @@ typedef struct bench_loop {
     void (*run)(uint64_t rounds, const void *memory, size_t bytes);
 } bench_loop;
 
-/* Kinds of instructions that a window kernel is made of. */
+/* Kinds of operations that a window kernel is made of; most are one instruction, on AVX2 some are two. */
 enum {
     BENCH_MULTIPLY_ADD, /* fused, or a dot product instruction (which is two where multiply and add are apart) */
     BENCH_MULTIPLY,
@@ -48,17 +48,18 @@ enum {
 };
 
 /*
- * The instructions that a kernel needs, without their dependencies: running them says how fast the kernel could be if
- * only the ports counted. `unit` is for each hidden unit of a network, `rest` for everything else of both networks;
- * both for `windows` windows.
+ * The operations that a kernel needs, without their dependencies: running them says how fast the kernel could be if
+ * only the ports counted. For `windows` windows: `pair` for each two hidden units of a network, `leaky` besides if its
+ * rectifier has a slope, `rest` for everything else of both networks.
  */
 typedef struct bench_mix {
     const char *precision; /* "fp32", "int16", "int8" */
     uint32_t windows;
-    uint16_t unit[BENCH_KINDS];
+    uint16_t pair[BENCH_KINDS];
+    uint16_t leaky[BENCH_KINDS];
     uint16_t rest[BENCH_KINDS];
-    /* As often as `blocks` says: `units` (of both networks together) times `unit`, once `rest`. */
-    void (*run)(uint64_t blocks, uint32_t units);
+    /* `blocks` times all that: plain_pairs without and leaky_pairs with slope, of both networks together. */
+    void (*run)(uint64_t blocks, uint32_t plain_pairs, uint32_t leaky_pairs);
 } bench_mix;
 
 typedef struct bench_isa {
@@ -77,8 +78,8 @@ const char *bench_kind_name(uint32_t kind);
 /* Least nanoseconds of a round in `repeats` measurements of about a millisecond each. */
 double bench_loop_ns(const bench_loop *loop, const void *memory, size_t bytes, uint32_t repeats);
 
-/* Least nanoseconds of a block, likewise. */
-double bench_mix_ns(const bench_mix *mix, uint32_t units, uint32_t repeats);
+/* Least nanoseconds of a block, likewise; pairs as in bench_mix.run. */
+double bench_mix_ns(const bench_mix *mix, uint32_t plain_pairs, uint32_t leaky_pairs, uint32_t repeats);
 
 /* Clock of this core in GHz while it computes: a chain of additions that take one cycle each. */
 double bench_clock_ghz(uint32_t repeats);

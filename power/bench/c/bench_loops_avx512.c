@@ -2,6 +2,7 @@
 #include <immintrin.h>
 
 #include "bench_isas.h"
+#include "upb_vectors_avx512.h"
 
 #ifdef BENCH_VNNI
 #define ISA_NAME "avx512-vnni"
@@ -14,30 +15,39 @@
 #define I_DOT16(sum, a, b) _mm512_add_epi32(sum, _mm512_madd_epi16(a, b))
 #endif
 #define F __m512
-#define I __m512i
 #define F_LANES 16
 #define OPAQUE(v) __asm__ volatile("" : "+v"(v))
 #define F_SET(x) _mm512_set1_ps(x)
 #define I_SET(x) _mm512_set1_epi32(x)
-#define LOAD(p) _mm512_load_si512(p)
-#define STORE(p, v) _mm512_store_si512(p, v)
 #define BROADCAST(p) broadcast(p)
 #define F_FMA(a, b, c) _mm512_fmadd_ps(a, b, c)
 #define F_ADD(a, b) _mm512_add_ps(a, b)
-#define F_MINMAX(a, b) _mm512_max_ps(a, b)
-#define F_COMPARE(v, a) use_mask16(_mm512_cmp_ps_mask(v, a, _CMP_GE_OQ))
-#define F_BLEND(v, a) v = _mm512_mask_blend_ps(0x5a5a, v, a)
-#define F_CONVERT(v) _mm512_cvtepi32_ps(_mm512_castps_si512(v))
-#define I_MUL(a, b) _mm512_mulhrs_epi16(a, b)
-#define I_ADD(a, b) _mm512_sub_epi16(a, b)
-#define I_MINMAX(a, b) _mm512_min_epu16(a, b)
-#define I_LOGIC(a, b) _mm512_xor_si512(a, b)
-#define I_COMPARE(v, a) use_mask32(_mm512_cmpge_epu16_mask(v, a))
-#define I_BLEND(v, a) v = _mm512_mask_blend_epi16(0x5a5a5a5au, v, a)
-#define I_SHIFT(v) _mm512_slli_epi16(v, 1)
-#define I_SHUFFLE(v, a) _mm512_unpacklo_epi16(v, a)
-#define AS_I(f) _Generic((f), __m512: _mm512_castps_si512, __m512i: same_i)(f)
+#define F_MUL(a, b) _mm512_mul_ps(a, b)
+#define F_MAX(a, b) _mm512_max_ps(a, b)
+#define F_FLOOR32(v) AS_F(_mm512_cvt_roundps_epi32(v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC))
+#define I_BLEND(a, b) _mm512_mask_blend_epi16(0x55555555u, a, b)
+#define I_SCALE(a, b) _mm512_mulhrs_epi16(a, b)
+#define I_MAX(a, b) _mm512_max_epi16(a, b)
+#define I_ADD32(a, b) _mm512_add_epi32(a, b)
+#define I_SHIFT32(v) _mm512_srli_epi32(v, 16)
+#define I_UNPACK(a, b) _mm512_unpacklo_epi16(a, b)
+#define I_LOOK_UP(table, v) _mm512_shuffle_epi8(table, v)
+#define AS_I(v) _Generic((v), __m512 : as_i, __m512i : same_i)(v)
 #define AS_F(i) _mm512_castsi512_ps(i)
+#define AS_SAME(v, i) _Generic((v), __m512 : as_f, __m512i : same_i)(i)
+#define START_MASK                                                                                                     \
+    __mmask32 mask = 0x5a5a5a5au;                                                                                      \
+    __asm__ volatile("" : "+k"(mask));
+#define MASK mask
+#define USE_MASK(v, m) __asm__ volatile("" : : "k"(m))
+#define SECOND_TEN b
+#define WEIGHT_READS 1
+#define MASK_ANDS 0
+#define FLOATS_SHUFFLES 3
+
+static inline __m512i as_i(__m512 f) { return _mm512_castps_si512(f); }
+
+static inline __m512 as_f(__m512i i) { return _mm512_castsi512_ps(i); }
 
 static inline __m512i same_i(__m512i i) { return i; }
 
@@ -47,9 +57,5 @@ static inline __m512i broadcast(const void *p) {
     __asm__ volatile("vpbroadcastd %1, %0" : "=v"(v) : "m"(*(const int32_t *)p));
     return v;
 }
-
-static inline void use_mask16(__mmask16 mask) { __asm__ volatile("" : : "k"(mask)); }
-
-static inline void use_mask32(__mmask32 mask) { __asm__ volatile("" : : "k"(mask)); }
 
 #include "bench_loops_template.h"

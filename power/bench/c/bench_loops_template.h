@@ -1,140 +1,238 @@
 /*
- * Loops of independent instructions in vectors: included once by each instruction set's file, which defines before
+ * Loops of independent instructions in vectors: included once by each instruction set's file, which includes its
+ * upb_vectors_*.h of the kernels, whose names are in upb_kernel_rules.h, and defines before
  *
  *   ISA_NAME, ISA_SYMBOL   its name; the bench_isa to define
- *   F, I                   vectors of floats and of integers;  F_LANES floats, so 2 * F_LANES 16-bit integers
+ *   F, F_LANES             a vector of floats, and of how many; V_LANES is twice that
  *   OPAQUE(v)              tells the compiler that v may have changed
- *   F_SET(x), I_SET(x)     all lanes; I_SET of 32 bits;  LOAD(p), STORE(p, v): whole vectors of I, aligned
+ *   START_MASK, MASK       makes a mask that the compiler does not know; the mask
+ *   USE_MASK(v, m)         M is used, or becomes v
+ *   F_SET(x), I_SET(x)     all lanes; I_SET of 32 bits
  *   BROADCAST(p)           the 32 bits at p in all lanes, I
- *   F_FMA(a, b, c), F_MUL, F_ADD, F_MINMAX(a, b)
- *   F_COMPARE(v, a), F_BLEND(v, a): statements, one compare or blend whose result becomes v, or is used;  F_CONVERT(v)
- *   I_DOT16(sum, a, b), I_MUL, I_ADD, I_MINMAX, I_LOGIC (a, b), I_COMPARE(v, a), I_BLEND(v, a), I_SHIFT(v),
- * I_SHUFFLE(v, a) I_DOT8(sum, a, b)      optional AS_I(f), AS_F(i)       the same bits
+ *   F_FMA(a, b, c), F_MUL, F_ADD, F_MAX (a, b);  F_FLOOR32(v) as in the float kernel, as F
+ *   I_DOT16(sum, a, b), I_SCALE, I_MAX, I_ADD32, I_BLEND, I_UNPACK (a, b);  I_SHIFT32(v)
+ *   I_DOT8(sum, a, b)      optional
+ *   AS_I(f), AS_F(i)       the same bits
+ *   SECOND_TEN             b, or a where registers are 16: the accumulators after a0 to a9
+ *   WEIGHT_READS           how often an integer kernel reads a weight: once for both halves of the windows, or 2
+ *   MASK_ANDS              1; or 0 where a comparison under a mask is one instruction
+ *   FLOATS_SHUFFLES        what puts two vectors of V_LOAD_FLOATS into one
  *
- * How many of which: the tables here. They count what the kernels in kernels/cpu must do for the rules of the model
- * file (empty pixels filled) in the cheapest order that is known, and are the counts that the loops run.
+ * How many of which: the tables here, operation by operation those of upb_kernel_rules.h, upb_kernel_f32_template.h,
+ * upb_kernel_int_template.h and upb_kernel_int_pairs.h, for empty pixels filled. They are the counts that the loops
+ * run. Not counted: what is the same for all windows of a call (constants, slope, nearest count), and shifts of
+ * distances, as k and j are 0 there in most models; those of intensities are not.
  */
 #include "bench.h"
 
-/* Instructions in every kernel, for one vector of windows and both networks: the column prepared, windows gathered. */
+/* The rules, for V_LANES windows: a column prepared, both networks' windows gathered, outputs given. */
 enum {
-    PREPARE_LOADS = 2 + 4,    /* counts, intensities, farthest counts; neighbours one lane on */
-    PREPARE_COMPARES = 2 + 2, /* range limits; top and bottom empty */
-    PREPARE_BLENDS = 2 + 4,   /* pixels out of range; four filled rows */
+    PREPARE_LOADS = 1,    /* counts */
+    PREPARE_LOADS_U8 = 1, /* intensities, widened */
+    PREPARE_AT_LEAST = 2, /* range limits */
+    PREPARE_IS_ZERO = 2,  /* top and bottom empty */
+    PREPARE_MASK_ANDS = 1 + 2,
+    PREPARE_KEEPS = 2,   /* pixels out of range */
+    PREPARE_NEXT = 2,    /* bottom neighbours */
+    PREPARE_SELECTS = 4, /* four filled rows */
     PREPARE_STORES = 4,
-    GATHER_LOADS = 12,         /* three columns, two rows, distance and intensity */
-    GATHER_COMPARES = 3,       /* empty columns, once for both networks */
-    GATHER_BLENDS = 4 * 7,     /* four rows of three columns: two, three and two */
-    GATHER_MINMAX = 4 + 2 * 5, /* the nearer of left and right; window minima */
-    GATHER_ADDS = 2 * 6,       /* differences from the minimum */
-    OUTPUT_COMPARES = 3,       /* limits, and a window without a return */
-    OUTPUT_BLENDS = 2,         /* points that are not given */
-    OUTPUT_MINMAX = 2,         /* intensity 0..255 */
-    OUTPUT_STORES = 2,
-    REST_LOADS = PREPARE_LOADS + GATHER_LOADS + 1,
-    REST_COMPARES = PREPARE_COMPARES + GATHER_COMPARES + OUTPUT_COMPARES,
-    REST_BLENDS = PREPARE_BLENDS + GATHER_BLENDS + OUTPUT_BLENDS,
-    REST_MINMAX = GATHER_MINMAX + OUTPUT_MINMAX,
-    REST_STORES = PREPARE_STORES + OUTPUT_STORES
+    GATHER_LOADS = 12,      /* three columns, two rows, distance and intensity */
+    GATHER_IS_ZERO = 3 + 1, /* empty columns, once for both networks; empty windows */
+    GATHER_MASK_ANDS = 3 + 1,
+    GATHER_SELECTS = 4 * 4, /* four rows: two for the left pixel, two for the right */
+    GATHER_MIN_WHERE = 4,   /* the middle one */
+    GATHER_MIN = 2 * 5,     /* window minima */
+    GATHER_SUB = 2 * 6,     /* differences from the minimum */
+    GIVE_FROM_W = 3,        /* distance, the same less 1, intensity */
+    GIVE_ADD32 = 2,         /* less 1 */
+    GIVE_MIN = 1,           /* intensity */
+    GIVE_AT_LEAST = 2,      /* limits */
+    GIVE_MASK_ANDS = 2,
+    GIVE_KEEPS = 2,
+    GIVE_STORES = 1,
+    GIVE_STORES_U8 = 1,
+    RULES_LIMITS = 2, /* farthest counts seen and given: a load, in float models V_LOAD_FLOATS */
+    RULES_LOADS = PREPARE_LOADS + GATHER_LOADS,
+    RULES_AT_LEAST = PREPARE_AT_LEAST + GIVE_AT_LEAST,
+    RULES_IS_ZERO = PREPARE_IS_ZERO + GATHER_IS_ZERO,
+    RULES_MASK_ANDS = (PREPARE_MASK_ANDS + GATHER_MASK_ANDS + GIVE_MASK_ANDS) * MASK_ANDS,
+    RULES_SELECTS = PREPARE_SELECTS + GATHER_SELECTS,
+    RULES_KEEPS = PREPARE_KEEPS + GIVE_KEEPS,
+    RULES_MIN = GATHER_MIN + GIVE_MIN,
+    RULES_STORES = PREPARE_STORES + GIVE_STORES
 };
 
-/* Float, for F_LANES windows. The rectifier is max(a, 0); what of it is linear is one affine map of the taps. */
+/* What both precisions do around the layers of both networks: W_ADD_V, and the offsets. */
+enum { SKIP_UNPACK = 2 * 2, SKIP_ADD32 = 2 * 2, OFFSET_LOADS = 2 };
+
+/* Float: V_LANES windows are two vectors. */
 enum {
-    F_UNIT_FMA = 7 + 1, /* seven taps; the output */
-    F_UNIT_MINMAX = 1,
-    F_UNIT_LOADS = 5,         /* nine weights, for two vectors */
-    F_REST_FMA = 2 * (7 + 1), /* what is linear; the minimum */
-    F_REST_ADDS = GATHER_ADDS + 2,
-    F_REST_CONVERTS = 2 + 2 + 2, /* inputs, floor, outputs */
-    F_REST_SHUFFLES = 2 + 2      /* inputs widened, outputs narrowed */
+    F_PAIR_FMA = 2 * 2 * (7 + 1), /* two units, two vectors: seven taps; the output */
+    F_PAIR_MAX = 2 * 2,
+    F_PAIR_LOADS = 2 * 9, /* the weights, once for both vectors */
+    F_LEAKY_MUL = 2 * 2,  /* slope */
+    F_UNPACK = 2 * 2 * 7, /* inputs widened: unpacked, one subtraction */
+    F_FROM_WORDS = 2 * 2 * 7,
+    F_ROUND_ADD = 2 * 2, /* a half; the cut; rounded down */
+    F_ROUND_MIN = 2 * 2,
+    F_FLOORS = 2 * 2,
+    F_ADDS = F_FROM_WORDS + F_ROUND_ADD
 };
 
-/* Integer, for 2 * F_LANES windows: inputs are 16 bits, sums two vectors of 32. */
+/* Integer: sums are two vectors of 32 bits. */
 enum {
-    I_UNIT_DOT = 2 * 4 + 1, /* four pairs of inputs in two vectors; half of the two vectors of outputs */
-    I_UNIT_MULTIPLY = 1,    /* slope */
-    I_UNIT_MINMAX = 1,
-    I_UNIT_SHUFFLE = 1, /* upper halves of two sums */
-    I_UNIT_LOADS = 6,
-    I_REST_ADDS = GATHER_ADDS + 2 * 2 + 2, /* the minimum; what is compared with the limits */
-    I_REST_LOGIC = 2 * 7,                  /* unsigned to signed */
-    I_REST_SHIFTS = 2 * 7 + 2 * 2,         /* inputs; outputs */
-    I_REST_SHUFFLES =
-        1 + 2 + 2 * (8 + 2) + 3 + 1, /* widened, next lanes, pairs of inputs and minima, packed, narrowed */
-    /* the block code of int8, both networks: the largest difference, its highest bit, three steps for each input */
-    CODE_LOGIC = 2 * (5 + 1 + 6),
-    CODE_SHIFTS = 2 * (2 + 2),
-    CODE_SHUFFLES = 2 * 2,
-    CODE_MINMAX = 2 * (1 + 1 + 6),
-    CODE_ADDS = 2 * (2 + 6)
+    I_PAIR_DOT = 2 * (2 * 4 + 1), /* two vectors: of two units four pairs of inputs; of both the output */
+    I_PAIR_MAX = 2,
+    I_PAIR_SHIFT = 2, /* upper halves of two sums: a shift and a blend */
+    I_PAIR_BLEND = 2,
+    I_PAIR_LOADS = WEIGHT_READS * (2 * (4 + 1) + 1), /* pairs of weights, bias; output weights */
+    I_LEAKY_SCALE = 2,
+    I_LIFT16 = 2, /* what is subtracted gets the sign bit: both networks in int16, intensities in int8 */
+    I_LIFT8 = 1,
+    I_XOR = 2, /* the minimum becomes signed */
+    I_UNPACK_PAIRS = 2 * 2 * 4,
+    I_SHIFT_BY = 1 + 1 + 1 + 2 * 2, /* of intensities: by k, the minimum back and by j; both outputs by t */
+    /* the block code of int8, of distances only */
+    CODE_OR = 5, /* as long as the largest */
+    CODE_SHIFT = 3,
+    CODE_TOP_LOGIC = 1, /* V_TOP_BIT: two halves of a byte looked up, the greater one */
+    CODE_TOP_SHIFT = 1,
+    CODE_TOP_SHUFFLE = 2,
+    CODE_TOP_MAX = 1,
+    CODE_MAX = 1,
+    CODE_SUB = 2,
+    CODE_XOR = 1,
+    CODE_ADD_SAT = 6, /* each difference: half a step, cleared and signed, saturated */
+    CODE_AND_XOR = 6,
+    CODE_MIN_SIGNED = 6
 };
 
 /*
- * TIMES(count, OP): `count` times OP(v), at most 48, v being the accumulators a0 to a11 by turns: more than an
- * instruction's latency times the instructions of a cycle, and few enough for 16 registers. Written out, since
- * compilers keep arrays that are indexed in a loop in memory.
+ * TIMES(count, OP): `count` times OP(v), at most 48, v being the accumulators a0 to a9 by turns, then b0 to b9 where
+ * registers are many: at least an instruction's latency times the instructions of a cycle, and few enough for 16
+ * registers with what they work on. It goes on with the accumulator after the last one's (`turn`, which the compiler
+ * knows), so that few of an operation do not all wait for the first accumulators. Written out, since compilers keep
+ * arrays that are indexed in a loop in memory.
  */
 #define ONE(n, count, OP, v)                                                                                           \
-    if ((n) < (int)(count)) {                                                                                          \
+    if ((n) >= turn && (n) < turn + (unsigned)(count)) {                                                               \
         OP(v);                                                                                                         \
         OPAQUE(v);                                                                                                     \
     }
-#define TWELVE(n, count, OP)                                                                                           \
-    ONE(n, count, OP, a0)                                                                                              \
-    ONE((n) + 1, count, OP, a1)                                                                                        \
-    ONE((n) + 2, count, OP, a2)                                                                                        \
-    ONE((n) + 3, count, OP, a3)                                                                                        \
-    ONE((n) + 4, count, OP, a4)                                                                                        \
-    ONE((n) + 5, count, OP, a5)                                                                                        \
-    ONE((n) + 6, count, OP, a6)                                                                                        \
-    ONE((n) + 7, count, OP, a7)                                                                                        \
-    ONE((n) + 8, count, OP, a8)                                                                                        \
-    ONE((n) + 9, count, OP, a9)                                                                                        \
-    ONE((n) + 10, count, OP, a10)                                                                                      \
-    ONE((n) + 11, count, OP, a11)
+#define TEN(n, count, OP, a)                                                                                           \
+    ONE((n) + 0, count, OP, a##0)                                                                                      \
+    ONE((n) + 1, count, OP, a##1)                                                                                      \
+    ONE((n) + 2, count, OP, a##2)                                                                                      \
+    ONE((n) + 3, count, OP, a##3)                                                                                      \
+    ONE((n) + 4, count, OP, a##4)                                                                                      \
+    ONE((n) + 5, count, OP, a##5)                                                                                      \
+    ONE((n) + 6, count, OP, a##6)                                                                                      \
+    ONE((n) + 7, count, OP, a##7)                                                                                      \
+    ONE((n) + 8, count, OP, a##8)                                                                                      \
+    ONE((n) + 9, count, OP, a##9)
+#define TEN_OF(n, count, OP, a) TEN(n, count, OP, a)
+#define TWENTY(n, count, OP)                                                                                           \
+    TEN(n, count, OP, a)                                                                                               \
+    TEN_OF((n) + 10, count, OP, SECOND_TEN)
 #define TIMES(count, OP)                                                                                               \
     {                                                                                                                  \
         _Static_assert((int)(count) <= (int)LOOP_TIMES, "TIMES goes up to 48");                                        \
-        TWELVE(0, count, OP) TWELVE(12, count, OP) TWELVE(24, count, OP) TWELVE(36, count, OP)                         \
+        TWENTY(0u, count, OP)                                                                                          \
+        TWENTY(20u, count, OP)                                                                                         \
+        TWENTY(40u, count, OP)                                                                                         \
+        TWENTY(60u, count, OP)                                                                                         \
+        turn = (turn + (unsigned)(count)) % 20u;                                                                       \
     }
 
-enum { LOOP_TIMES = 48, SCRATCH = 8, FOUR = 4 };
+enum { LOOP_TIMES = 48, TINY_IS_ZERO = 0x8040 /* of MXCSR: inputs and results */, OUT = 4 * UPB_ALIGN };
 
-static _Alignas(4096) unsigned char scratch[SCRATCH * UPB_ALIGN];
+/* Read at the beginning, written from OUT on: loads that wait for stores are no matter of ports. */
+static _Alignas(4096) unsigned char scratch[2 * OUT];
 
-#define DO_LOAD(v)                                                                                                     \
+/* Somewhere, as far as the compiler knows: it may neither leave out a load nor do one for many. */
+static inline const void *any_memory(void) {
+    const void *p = scratch;
+    __asm__ volatile("" : "+r"(p));
+    return p;
+}
+
+#define DO_WEIGHT(v)                                                                                                   \
     {                                                                                                                  \
         I loaded = BROADCAST(scratch);                                                                                 \
         OPAQUE(loaded);                                                                                                \
     }
-#define DO_STORE(v) STORE(scratch, AS_I(v))
+#define LOADED(how)                                                                                                    \
+    {                                                                                                                  \
+        V loaded = how(any_memory());                                                                                  \
+        OPAQUE(loaded);                                                                                                \
+    }
+#define DO_LOAD(v) LOADED(V_LOADU)
+#define DO_LOAD_U8(v) LOADED(V_LOAD_U8)
+#define DO_LOAD_FLOATS(v) LOADED(V_LOAD_FLOATS)
+#define DO_STORE(v) V_STOREU((void *)(scratch + OUT), AS_I(v))
+#define DO_STORE_U8(v) V_STORE_U8(scratch + OUT, AS_I(v))
 #define DO_F_FMA(v) v = F_FMA(v, x, y)
+#define DO_F_MUL(v) v = F_MUL(v, x)
 #define DO_F_ADD(v) v = F_ADD(v, x)
-#define DO_F_MINMAX(v) v = F_MINMAX(v, x)
-#define DO_F_COMPARE(v) F_COMPARE(v, x)
-#define DO_F_BLEND(v) F_BLEND(v, x)
-#define DO_F_CONVERT(v) v = F_CONVERT(v)
-#define DO_F_SHUFFLE(v) v = AS_F(I_SHUFFLE(AS_I(v), AS_I(x)))
+#define DO_F_MAX(v) v = F_MAX(v, x)
+#define DO_F_FLOOR(v) v = F_FLOOR32(v)
 /* Where multiply and add are apart, the product must be computed anew. */
 #define DO_I_DOT16(v)                                                                                                  \
     OPAQUE(y);                                                                                                         \
     v = I_DOT16(v, x, y)
-#define DO_I_MULTIPLY(v) v = I_MUL(v, x)
-#define DO_I_ADD(v) v = I_ADD(v, x)
-#define DO_I_MINMAX(v) v = I_MINMAX(v, x)
-#define DO_I_LOGIC(v) v = I_LOGIC(v, x)
-#define DO_I_COMPARE(v) I_COMPARE(v, x)
-#define DO_I_BLEND(v) I_BLEND(v, x)
-#define DO_I_SHIFT(v) v = I_SHIFT(v)
-#define DO_I_SHUFFLE(v) v = I_SHUFFLE(v, x)
+#define DO_I_SCALE(v) v = I_SCALE(v, x)
+#define DO_I_MAX(v) v = I_MAX(v, x)
+#define DO_I_BLEND(v) v = I_BLEND(v, x)
+#define DO_I_SHIFT32(v) v = I_SHIFT32(v)
+/* On floats too: the same registers. */
+#define DO_V(v, result)                                                                                                \
+    {                                                                                                                  \
+        V in = AS_I(v);                                                                                                \
+        in = result;                                                                                                   \
+        v = AS_SAME(v, in);                                                                                            \
+    }
+#define DO_AT_LEAST(v)                                                                                                 \
+    {                                                                                                                  \
+        const M at_least = M_AT_LEAST(AS_I(v), AS_I(x));                                                               \
+        USE_MASK(v, at_least);                                                                                         \
+    }
+#define DO_IS_ZERO(v)                                                                                                  \
+    {                                                                                                                  \
+        const M is_zero = M_IS_ZERO(AS_I(v));                                                                          \
+        USE_MASK(v, is_zero);                                                                                          \
+    }
+#define DO_SELECT(v) DO_V(v, V_SELECT(MASK, AS_I(x), in))
+#define DO_MIN_WHERE(v) DO_V(v, V_MIN_WHERE(MASK, AS_I(x), in, AS_I(y)))
+#define DO_KEEP(v) DO_V(v, V_KEEP(MASK, in))
+#define DO_MIN(v) DO_V(v, V_MIN(in, AS_I(x)))
+#define DO_MAX(v) DO_V(v, V_MAX(in, AS_I(x)))
+#define DO_MIN_SIGNED(v) DO_V(v, V_MIN_SIGNED(in, AS_I(x)))
+#define DO_SUB(v) DO_V(v, V_SUB(in, AS_I(x)))
+#define DO_ADD_SAT(v) DO_V(v, V_ADD_SAT(in, AS_I(x)))
+#define DO_ADD32(v) DO_V(v, I_ADD32(in, AS_I(x)))
+#define DO_LOGIC(v) DO_V(v, V_XOR(in, AS_I(x)))
+#define DO_AND_XOR(v) DO_V(v, V_AND_XOR(in, AS_I(x), AS_I(y)))
+#define DO_SHIFT(v) DO_V(v, V_SHIFT_LEFT(in, 1))
+#define DO_SHIFT_BY(v) DO_V(v, V_SHIFT_LEFT(in, shift))
+#define DO_UNPACK(v) DO_V(v, I_UNPACK(in, AS_I(x)))
+#define DO_LOOK_UP(v) DO_V(v, I_LOOK_UP(AS_I(x), in))
+#define DO_FROM_W(v) DO_V(v, V_FROM_W(((W){{in, AS_I(x)}})))
+#define DO_NEXT(v) DO_V(v, V_NEXT(in, AS_I(x)))
 
 #define START(T, x_value, y_value)                                                                                     \
     T x = x_value, y = y_value;                                                                                        \
-    T a0 = y, a1 = y, a2 = y, a3 = y, a4 = y, a5 = y, a6 = y, a7 = y, a8 = y, a9 = y, a10 = y, a11 = y;                \
+    T a0 = y, a1 = y, a2 = y, a3 = y, a4 = y, a5 = y, a6 = y, a7 = y, a8 = y, a9 = y;                                  \
+    T b0 = y, b1 = y, b2 = y, b3 = y, b4 = y, b5 = y, b6 = y, b7 = y, b8 = y, b9 = y;                                  \
+    (void)b0, (void)b1, (void)b2, (void)b3, (void)b4, (void)b5, (void)b6, (void)b7, (void)b8, (void)b9;                \
+    unsigned turn = 0;                                                                                                 \
     OPAQUE(x);                                                                                                         \
     OPAQUE(y);
 #define F_START START(F, F_SET(0.999f), F_SET(0.001f))
 #define I_START START(I, I_SET(0x00030005), I_SET(0x00070002))
+#define RULES_START                                                                                                    \
+    unsigned shift = 1;                                                                                                \
+    START_MASK                                                                                                         \
+    __asm__ volatile("" : "+r"(shift));
 
 static void loop_fma(uint64_t rounds, const void *memory, size_t bytes) {
     F_START(void) memory, (void)bytes;
@@ -163,9 +261,10 @@ static void loop_load(uint64_t rounds, const void *memory, size_t bytes) {
     const unsigned char *p = memory, *const end = p + bytes;
     while (rounds--) {
         for (const unsigned char *const next = p + PAGE; p != next; p += STEP) {
-            I l0 = LOAD(p), l1 = LOAD(p + sizeof(I)), l2 = LOAD(p + 2 * sizeof(I)), l3 = LOAD(p + 3 * sizeof(I));
-            I l4 = LOAD(p + 4 * sizeof(I)), l5 = LOAD(p + 5 * sizeof(I)), l6 = LOAD(p + 6 * sizeof(I)),
-              l7 = LOAD(p + 7 * sizeof(I));
+            I l0 = V_LOAD(p), l1 = V_LOAD(p + sizeof(I)), l2 = V_LOAD(p + 2 * sizeof(I)),
+              l3 = V_LOAD(p + 3 * sizeof(I));
+            I l4 = V_LOAD(p + 4 * sizeof(I)), l5 = V_LOAD(p + 5 * sizeof(I)), l6 = V_LOAD(p + 6 * sizeof(I)),
+              l7 = V_LOAD(p + 7 * sizeof(I));
             OPAQUE(l0);
             OPAQUE(l1);
             OPAQUE(l2);
@@ -179,97 +278,125 @@ static void loop_load(uint64_t rounds, const void *memory, size_t bytes) {
     }
 }
 
-/* `count` hidden units; four at a time, so that no accumulator's turn comes before its result. */
-#define F_UNITS(count)                                                                                                 \
-    TIMES((count) * F_UNIT_LOADS, DO_LOAD)                                                                             \
-    TIMES((count) * F_UNIT_FMA, DO_F_FMA)                                                                              \
-    TIMES((count) * F_UNIT_MINMAX, DO_F_MINMAX)
+/* All but the layers and what is around them. */
+#define RULES                                                                                                          \
+    TIMES(RULES_LOADS, DO_LOAD)                                                                                        \
+    TIMES(PREPARE_LOADS_U8, DO_LOAD_U8)                                                                                \
+    TIMES(RULES_AT_LEAST, DO_AT_LEAST)                                                                                 \
+    TIMES(RULES_IS_ZERO, DO_IS_ZERO)                                                                                   \
+    TIMES(RULES_MASK_ANDS, DO_LOGIC)                                                                                   \
+    TIMES(RULES_KEEPS, DO_KEEP)                                                                                        \
+    TIMES(PREPARE_NEXT, DO_NEXT)                                                                                       \
+    TIMES(RULES_SELECTS, DO_SELECT)                                                                                    \
+    TIMES(GATHER_MIN_WHERE, DO_MIN_WHERE)                                                                              \
+    TIMES(RULES_MIN, DO_MIN)                                                                                           \
+    TIMES(GATHER_SUB, DO_SUB)                                                                                          \
+    TIMES(OFFSET_LOADS, DO_WEIGHT)                                                                                     \
+    TIMES(SKIP_UNPACK, DO_UNPACK)                                                                                      \
+    TIMES(SKIP_ADD32 + GIVE_ADD32, DO_ADD32)                                                                           \
+    TIMES(GIVE_FROM_W, DO_FROM_W)                                                                                      \
+    TIMES(RULES_STORES, DO_STORE)                                                                                      \
+    TIMES(GIVE_STORES_U8, DO_STORE_U8)
 
-static void mix_f32(uint64_t blocks, uint32_t units) {
-    F_START
-    while (blocks--) {
-        uint32_t left = units;
-        TIMES(REST_LOADS, DO_LOAD)
-        TIMES(REST_COMPARES, DO_F_COMPARE)
-        TIMES(REST_BLENDS, DO_F_BLEND)
-        TIMES(REST_MINMAX, DO_F_MINMAX)
-        TIMES(F_REST_FMA, DO_F_FMA)
-        TIMES(F_REST_ADDS, DO_F_ADD)
-        TIMES(F_REST_CONVERTS, DO_F_CONVERT)
-        TIMES(F_REST_SHUFFLES, DO_F_SHUFFLE)
-        TIMES(REST_STORES, DO_STORE)
-        for (; left >= FOUR; left -= FOUR) {
-            F_UNITS(FOUR)
-        }
-        for (; left; left--) {
-            F_UNITS(1)
-        }
-    }
-}
-
-#define I_UNITS(count)                                                                                                 \
-    TIMES((count) * I_UNIT_LOADS, DO_LOAD)                                                                             \
-    TIMES((count) * I_UNIT_DOT, DO_I_DOT16)                                                                            \
-    TIMES((count) * I_UNIT_SHUFFLE, DO_I_SHUFFLE)                                                                      \
-    TIMES((count) * I_UNIT_MULTIPLY, DO_I_MULTIPLY)                                                                    \
-    TIMES((count) * I_UNIT_MINMAX, DO_I_MINMAX)
-#define I_ALL_UNITS                                                                                                    \
-    for (; left >= FOUR; left -= FOUR) {                                                                               \
-        I_UNITS(FOUR)                                                                                                  \
+/* Pairs of units: the accumulators' turns begin anew, so that the compiler knows them. */
+#define ALL_PAIRS(PAIR, LEAKY)                                                                                         \
+    for (uint32_t left = plain; left; left--) {                                                                        \
+        turn = 0;                                                                                                      \
+        PAIR                                                                                                           \
     }                                                                                                                  \
-    for (; left; left--) {                                                                                             \
-        I_UNITS(1)                                                                                                     \
-    }
-#define I_REST                                                                                                         \
-    TIMES(REST_LOADS, DO_LOAD)                                                                                         \
-    TIMES(REST_COMPARES, DO_I_COMPARE)                                                                                 \
-    TIMES(REST_BLENDS, DO_I_BLEND)                                                                                     \
-    TIMES(REST_MINMAX, DO_I_MINMAX)                                                                                    \
-    TIMES(I_REST_ADDS, DO_I_ADD)                                                                                       \
-    TIMES(I_REST_LOGIC, DO_I_LOGIC)                                                                                    \
-    TIMES(I_REST_SHIFTS, DO_I_SHIFT)                                                                                   \
-    TIMES(I_REST_SHUFFLES, DO_I_SHUFFLE)                                                                               \
-    TIMES(REST_STORES, DO_STORE)
+    for (uint32_t left = leaky; left; left--) {                                                                        \
+        turn = 0;                                                                                                      \
+        PAIR LEAKY                                                                                                     \
+    }                                                                                                                  \
+    turn = 0;
 
-static void mix_int16(uint64_t blocks, uint32_t units) {
-    I_START
+#define F_PAIR                                                                                                         \
+    TIMES(F_PAIR_LOADS, DO_WEIGHT)                                                                                     \
+    TIMES(F_PAIR_FMA, DO_F_FMA)                                                                                        \
+    TIMES(F_PAIR_MAX, DO_F_MAX)
+
+static void mix_f32(uint64_t blocks, uint32_t plain, uint32_t leaky) {
+    F_START
+    RULES_START
+    /* What integer operations leave is no number that means anything: tiny ones must not cost more than others. */
+    const unsigned control = _mm_getcsr();
+    _mm_setcsr(control | TINY_IS_ZERO);
     while (blocks--) {
-        uint32_t left = units;
-        I_REST
-        I_ALL_UNITS
+        RULES
+        TIMES(RULES_LIMITS, DO_LOAD_FLOATS)
+        TIMES(F_UNPACK, DO_UNPACK)
+        TIMES(F_ADDS, DO_F_ADD)
+        TIMES(F_ROUND_MIN, DO_F_MAX)
+        TIMES(F_FLOORS, DO_F_FLOOR)
+        ALL_PAIRS(F_PAIR, TIMES(F_LEAKY_MUL, DO_F_MUL))
+    }
+    _mm_setcsr(control);
+}
+
+#define I_PAIR                                                                                                         \
+    TIMES(I_PAIR_LOADS, DO_WEIGHT)                                                                                     \
+    TIMES(I_PAIR_DOT, DO_I_DOT16)                                                                                      \
+    TIMES(I_PAIR_SHIFT, DO_I_SHIFT32)                                                                                  \
+    TIMES(I_PAIR_BLEND, DO_I_BLEND)                                                                                    \
+    TIMES(I_PAIR_MAX, DO_I_MAX)
+#define I_ALL_PAIRS ALL_PAIRS(I_PAIR, TIMES(I_LEAKY_SCALE, DO_I_SCALE))
+#define I_REST(lifts)                                                                                                  \
+    RULES                                                                                                              \
+    TIMES(RULES_LIMITS, DO_LOAD)                                                                                       \
+    TIMES(lifts, DO_SUB)                                                                                               \
+    TIMES(I_XOR, DO_LOGIC)                                                                                             \
+    TIMES(I_UNPACK_PAIRS, DO_UNPACK)                                                                                   \
+    TIMES(I_SHIFT_BY, DO_SHIFT_BY)
+
+static void mix_int16(uint64_t blocks, uint32_t plain, uint32_t leaky) {
+    I_START
+    RULES_START
+    while (blocks--) {
+        I_REST(I_LIFT16)
+        I_ALL_PAIRS
     }
 }
 
-static void mix_int8(uint64_t blocks, uint32_t units) {
+static void mix_int8(uint64_t blocks, uint32_t plain, uint32_t leaky) {
     I_START
+    RULES_START
     while (blocks--) {
-        uint32_t left = units;
-        I_REST
-        TIMES(CODE_LOGIC, DO_I_LOGIC)
-        TIMES(CODE_SHIFTS, DO_I_SHIFT)
-        TIMES(CODE_SHUFFLES, DO_I_SHUFFLE)
-        TIMES(CODE_MINMAX, DO_I_MINMAX)
-        TIMES(CODE_ADDS, DO_I_ADD)
-        I_ALL_UNITS
+        I_REST(I_LIFT8)
+        TIMES(CODE_OR + CODE_TOP_LOGIC + CODE_XOR, DO_LOGIC)
+        TIMES(CODE_SHIFT + CODE_TOP_SHIFT, DO_SHIFT)
+        TIMES(CODE_TOP_SHUFFLE, DO_LOOK_UP)
+        TIMES(CODE_TOP_MAX + CODE_MAX, DO_MAX)
+        TIMES(CODE_SUB, DO_SUB)
+        TIMES(CODE_ADD_SAT, DO_ADD_SAT)
+        TIMES(CODE_AND_XOR, DO_AND_XOR)
+        TIMES(CODE_MIN_SIGNED, DO_MIN_SIGNED)
+        I_ALL_PAIRS
     }
 }
 
-#define I_UNIT_COUNTS                                                                                                  \
-    {[BENCH_MULTIPLY_ADD] = I_UNIT_DOT,                                                                                \
-     [BENCH_MULTIPLY] = I_UNIT_MULTIPLY,                                                                               \
-     [BENCH_MINMAX] = I_UNIT_MINMAX,                                                                                   \
-     [BENCH_SHUFFLE] = I_UNIT_SHUFFLE,                                                                                 \
-     [BENCH_LOAD] = I_UNIT_LOADS}
+/* Operations of the rules and of the output by kind, which all precisions share. */
+enum {
+    REST_ADDS = GATHER_SUB + SKIP_ADD32 + GIVE_ADD32,
+    REST_MINMAX = RULES_MIN + GATHER_MIN_WHERE,
+    REST_COMPARES = RULES_AT_LEAST + RULES_IS_ZERO,
+    REST_BLENDS = RULES_SELECTS + RULES_KEEPS,
+    REST_SHUFFLES = PREPARE_LOADS_U8 + PREPARE_NEXT + SKIP_UNPACK + GIVE_FROM_W + GIVE_STORES_U8,
+    REST_LOADS = RULES_LOADS + PREPARE_LOADS_U8 + OFFSET_LOADS,
+    REST_STORES = RULES_STORES + GIVE_STORES_U8
+};
+
+#define I_PAIR_COUNTS                                                                                                  \
+    {                                                                                                                  \
+        [BENCH_MULTIPLY_ADD] = I_PAIR_DOT, [BENCH_MINMAX] = I_PAIR_MAX, [BENCH_BLEND] = I_PAIR_BLEND,                  \
+        [BENCH_SHIFT] = I_PAIR_SHIFT, [BENCH_LOAD] = I_PAIR_LOADS                                                      \
+    }
 #define I_REST_COUNTS(logic, shifts, shuffles, minmax, adds)                                                           \
-    {[BENCH_ADD] = I_REST_ADDS + (adds),                                                                               \
-     [BENCH_MINMAX] = REST_MINMAX + (minmax),                                                                          \
-     [BENCH_COMPARE] = REST_COMPARES,                                                                                  \
-     [BENCH_BLEND] = REST_BLENDS,                                                                                      \
-     [BENCH_LOGIC] = I_REST_LOGIC + (logic),                                                                           \
-     [BENCH_SHIFT] = I_REST_SHIFTS + (shifts),                                                                         \
-     [BENCH_SHUFFLE] = I_REST_SHUFFLES + (shuffles),                                                                   \
-     [BENCH_LOAD] = REST_LOADS,                                                                                        \
-     [BENCH_STORE] = REST_STORES}
+    {                                                                                                                  \
+        [BENCH_ADD] = REST_ADDS + (adds), [BENCH_MINMAX] = REST_MINMAX + (minmax), [BENCH_COMPARE] = REST_COMPARES,    \
+        [BENCH_BLEND] = REST_BLENDS, [BENCH_LOGIC] = RULES_MASK_ANDS + I_XOR + (logic),                                \
+        [BENCH_SHIFT] = I_SHIFT_BY + (shifts), [BENCH_SHUFFLE] = REST_SHUFFLES + I_UNPACK_PAIRS + (shuffles),          \
+        [BENCH_LOAD] = REST_LOADS + RULES_LIMITS, [BENCH_STORE] = REST_STORES                                          \
+    }
 
 static const bench_loop loops[] = {
     {"fma_f32", LOOP_TIMES *F_LANES, loop_fma},
@@ -282,20 +409,31 @@ static const bench_loop loops[] = {
 
 static const bench_mix mixes[] = {
     {"fp32",
-     F_LANES,
-     {[BENCH_MULTIPLY_ADD] = F_UNIT_FMA, [BENCH_MINMAX] = F_UNIT_MINMAX, [BENCH_LOAD] = F_UNIT_LOADS},
-     {[BENCH_MULTIPLY_ADD] = F_REST_FMA,
-      [BENCH_ADD] = F_REST_ADDS,
-      [BENCH_MINMAX] = REST_MINMAX,
+     V_LANES,
+     {[BENCH_MULTIPLY_ADD] = F_PAIR_FMA, [BENCH_MINMAX] = F_PAIR_MAX, [BENCH_LOAD] = F_PAIR_LOADS},
+     {[BENCH_MULTIPLY] = F_LEAKY_MUL},
+     {[BENCH_ADD] = REST_ADDS + F_ADDS,
+      [BENCH_MINMAX] = REST_MINMAX + F_ROUND_MIN,
       [BENCH_COMPARE] = REST_COMPARES,
       [BENCH_BLEND] = REST_BLENDS,
-      [BENCH_CONVERT] = F_REST_CONVERTS,
-      [BENCH_SHUFFLE] = F_REST_SHUFFLES,
-      [BENCH_LOAD] = REST_LOADS,
+      [BENCH_LOGIC] = RULES_MASK_ANDS,
+      [BENCH_CONVERT] = F_FLOORS + 2 * RULES_LIMITS,
+      [BENCH_SHUFFLE] = REST_SHUFFLES + F_UNPACK + FLOATS_SHUFFLES * RULES_LIMITS,
+      [BENCH_LOAD] = REST_LOADS + 2 * RULES_LIMITS,
       [BENCH_STORE] = REST_STORES},
      mix_f32},
-    {"int16", 2 * F_LANES, I_UNIT_COUNTS, I_REST_COUNTS(0, 0, 0, 0, 0), mix_int16},
-    {"int8", 2 * F_LANES, I_UNIT_COUNTS, I_REST_COUNTS(CODE_LOGIC, CODE_SHIFTS, CODE_SHUFFLES, CODE_MINMAX, CODE_ADDS),
+    {"int16",
+     V_LANES,
+     I_PAIR_COUNTS,
+     {[BENCH_MULTIPLY] = I_LEAKY_SCALE},
+     I_REST_COUNTS(0, 0, 0, 0, I_LIFT16),
+     mix_int16},
+    {"int8",
+     V_LANES,
+     I_PAIR_COUNTS,
+     {[BENCH_MULTIPLY] = I_LEAKY_SCALE},
+     I_REST_COUNTS(CODE_OR + CODE_TOP_LOGIC + CODE_XOR + CODE_AND_XOR, CODE_SHIFT + CODE_TOP_SHIFT, CODE_TOP_SHUFFLE,
+                   CODE_TOP_MAX + CODE_MAX + CODE_MIN_SIGNED, I_LIFT8 + CODE_SUB + CODE_ADD_SAT),
      mix_int8},
 };
 

@@ -87,16 +87,16 @@ double bench_loop_ns(const bench_loop *loop, const void *memory, size_t bytes, u
 
 typedef struct mix_run {
     const bench_mix *mix;
-    uint32_t units;
+    uint32_t plain_pairs, leaky_pairs;
 } mix_run;
 
 static void run_mix(const void *what, uint64_t rounds) {
     const mix_run *r = what;
-    r->mix->run(rounds, r->units);
+    r->mix->run(rounds, r->plain_pairs, r->leaky_pairs);
 }
 
-double bench_mix_ns(const bench_mix *mix, uint32_t units, uint32_t repeats) {
-    const mix_run r = {mix, units};
+double bench_mix_ns(const bench_mix *mix, uint32_t plain_pairs, uint32_t leaky_pairs, uint32_t repeats) {
+    const mix_run r = {mix, plain_pairs, leaky_pairs};
     return least_ns(run_mix, &r, repeats);
 }
 

@@ -162,19 +162,21 @@ nb::list mixes() {
             d["isa"] = isa->name;
             d["precision"] = mix.precision;
             d["windows"] = mix.windows;
-            d["unit"] = counts(mix.unit);
+            d["pair"] = counts(mix.pair);
+            d["leaky"] = counts(mix.leaky);
             d["rest"] = counts(mix.rest);
             all.append(d);
         }
     return all;
 }
 
-double mix_ns(const std::string &name, const std::string &precision, uint32_t units, uint32_t repeats) {
+double mix_ns(const std::string &name, const std::string &precision, uint32_t plain_pairs, uint32_t leaky_pairs,
+              uint32_t repeats) {
     for (const bench_isa *isa : isas())
         for (uint32_t k = 0; k < isa->mix_count; ++k)
             if (isa->name == name && isa->mixes[k].precision == precision) {
                 nb::gil_scoped_release release;
-                return bench_mix_ns(&isa->mixes[k], units, repeats);
+                return bench_mix_ns(&isa->mixes[k], plain_pairs, leaky_pairs, repeats);
             }
     throw nb::value_error(("no mix " + precision + " for " + name + " on this machine").c_str());
 }
@@ -202,8 +204,9 @@ NB_MODULE(_native, m) {
         .def("latency", &Job::latency, "pushes"_a, "interval_ns"_a, "Quantiles of the time from push to sink.");
     m.def("loop_names", &loop_names, "(isa, kind, multiply-adds or bytes of a round) of this machine's loops.");
     m.def("loop_ns", &loop_ns, "isa"_a, "kind"_a, "bytes"_a = 4096, "repeats"_a = 5, "Nanoseconds of a round.");
-    m.def("mixes", &mixes, "This machine's mixes of instructions: isa, precision, windows, unit, rest.");
-    m.def("mix_ns", &mix_ns, "isa"_a, "precision"_a, "units"_a, "repeats"_a = 5, "Nanoseconds of a block.");
+    m.def("mixes", &mixes, "This machine's mixes of operations: isa, precision, windows, pair, leaky, rest.");
+    m.def("mix_ns", &mix_ns, "isa"_a, "precision"_a, "plain_pairs"_a, "leaky_pairs"_a, "repeats"_a = 5,
+          "Nanoseconds of a block; pairs of hidden units of both networks together.");
     m.def("clock_ghz", &bench_clock_ghz, "repeats"_a = 5);
     m.def("time_call", &time_call, "call"_a, "argument"_a, "repeats"_a,
           "Nanoseconds of each of `repeats` calls of the C function at address `call` with a pointer.");
