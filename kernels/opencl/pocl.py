@@ -28,8 +28,8 @@ CPU_VARIABLE = "UPBEAM_POCL_CPU"
 """Environment variable: ``off``, or LLVM's name of a processor."""
 
 _UNKNOWN = b"generic\0"
-_STRUCT_BYTES = 2048
-"""Looked through; the device's struct of PoCL 3 is longer."""
+_STRUCT_BYTES = 1024
+"""Looked through: the name stands at byte 640; beyond the struct is other memory, which may hold another."""
 _LEVELS: tuple[tuple[str, set[str]], ...] = (
     ("skylake-avx512", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2", "adx"}),
     ("haswell", {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"}),

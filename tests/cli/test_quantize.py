@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import upbeam
@@ -96,14 +97,18 @@ def test_the_same_bytes_again(tmp_path):
     for name in ("a", "b"):
         run("quantize", "-o", tmp_path / f"{name}.ubm", "--frames", 1, "--precision", "int16", "--seed", 9)
     assert (tmp_path / "a.ubm").read_bytes() == (tmp_path / "b.ubm").read_bytes()
-    assert read_ubm(tmp_path / "a.ubm").precisions == ["fp32", "int16"]
+    made, shipped = read_ubm(tmp_path / "a.ubm"), upbeam.load_model().file
+    assert made.precisions == ["fp32", "int16", "int8"]  # the other precision stays as it was
+    assert made.int8 is not None
+    assert shipped.int8 is not None
+    assert np.array_equal(made.int8.distance.weight, shipped.int8.distance.weight)
 
 
 def test_tables_for_people(tmp_path):
     done = run("quantize", "-o", tmp_path / "m.ubm", "--frames", 1, "--precision", "int16")
     for text in ("against float", "p99.9", "moved", "coarse", "flips", "ghosts", "bytes", "against the truth"):
         assert text in done.stdout
-    assert "those it was calibrated on" in done.stdout.replace("\n", " ")
+    assert "those it was calibrated on" in " ".join(done.stdout.split())
 
 
 @pytest.mark.parametrize(
@@ -150,7 +155,7 @@ def test_every_backend_gives_the_same_bits(made):
     for name, backend in report["backends"].items():
         assert backend["first_mismatch"] is None
         for vectors, count in backend["sets"].items():
-            if name.endswith("numpy") and vectors != "golden":
+            if (name.endswith("numpy") and vectors != "golden") or ("opencl" in name and vectors == "stream"):
                 assert count is None
             elif name != "fp32 cpu scalar":
                 assert (count["differing"], count["windows"] > 0) == (0, True)

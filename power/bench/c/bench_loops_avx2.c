@@ -24,9 +24,9 @@
 #define I_SHIFT32(v) _mm256_srli_epi32(v, 16)
 #define I_UNPACK(a, b) _mm256_unpacklo_epi16(a, b)
 #define I_LOOK_UP(table, v) _mm256_shuffle_epi8(table, v)
-#define AS_I(v) _Generic((v), __m256 : as_i, __m256i : same_i)(v)
+#define AS_I(v) _Generic((v), __m256: as_i, __m256i: same_i)(v)
 #define AS_F(i) _mm256_castsi256_ps(i)
-#define AS_SAME(v, i) _Generic((v), __m256 : as_f, __m256i : same_i)(i)
+#define AS_SAME(v, i) _Generic((v), __m256: as_f, __m256i: same_i)(i)
 /* No register of its own: there are 16. */
 #define START_MASK
 #define MASK AS_I(y)

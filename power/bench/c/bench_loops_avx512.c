@@ -32,9 +32,9 @@
 #define I_SHIFT32(v) _mm512_srli_epi32(v, 16)
 #define I_UNPACK(a, b) _mm512_unpacklo_epi16(a, b)
 #define I_LOOK_UP(table, v) _mm512_shuffle_epi8(table, v)
-#define AS_I(v) _Generic((v), __m512 : as_i, __m512i : same_i)(v)
+#define AS_I(v) _Generic((v), __m512: as_i, __m512i: same_i)(v)
 #define AS_F(i) _mm512_castsi512_ps(i)
-#define AS_SAME(v, i) _Generic((v), __m512 : as_f, __m512i : same_i)(i)
+#define AS_SAME(v, i) _Generic((v), __m512: as_f, __m512i: same_i)(i)
 #define START_MASK                                                                                                     \
     __mmask32 mask = 0x5a5a5a5au;                                                                                      \
     __asm__ volatile("" : "+k"(mask));

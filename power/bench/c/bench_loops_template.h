@@ -386,17 +386,21 @@ enum {
 };
 
 #define I_PAIR_COUNTS                                                                                                  \
-    {                                                                                                                  \
-        [BENCH_MULTIPLY_ADD] = I_PAIR_DOT, [BENCH_MINMAX] = I_PAIR_MAX, [BENCH_BLEND] = I_PAIR_BLEND,                  \
-        [BENCH_SHIFT] = I_PAIR_SHIFT, [BENCH_LOAD] = I_PAIR_LOADS                                                      \
-    }
+    {[BENCH_MULTIPLY_ADD] = I_PAIR_DOT,                                                                                \
+     [BENCH_MINMAX] = I_PAIR_MAX,                                                                                      \
+     [BENCH_BLEND] = I_PAIR_BLEND,                                                                                     \
+     [BENCH_SHIFT] = I_PAIR_SHIFT,                                                                                     \
+     [BENCH_LOAD] = I_PAIR_LOADS}
 #define I_REST_COUNTS(logic, shifts, shuffles, minmax, adds)                                                           \
-    {                                                                                                                  \
-        [BENCH_ADD] = REST_ADDS + (adds), [BENCH_MINMAX] = REST_MINMAX + (minmax), [BENCH_COMPARE] = REST_COMPARES,    \
-        [BENCH_BLEND] = REST_BLENDS, [BENCH_LOGIC] = RULES_MASK_ANDS + I_XOR + (logic),                                \
-        [BENCH_SHIFT] = I_SHIFT_BY + (shifts), [BENCH_SHUFFLE] = REST_SHUFFLES + I_UNPACK_PAIRS + (shuffles),          \
-        [BENCH_LOAD] = REST_LOADS + RULES_LIMITS, [BENCH_STORE] = REST_STORES                                          \
-    }
+    {[BENCH_ADD] = REST_ADDS + (adds),                                                                                 \
+     [BENCH_MINMAX] = REST_MINMAX + (minmax),                                                                          \
+     [BENCH_COMPARE] = REST_COMPARES,                                                                                  \
+     [BENCH_BLEND] = REST_BLENDS,                                                                                      \
+     [BENCH_LOGIC] = RULES_MASK_ANDS + I_XOR + (logic),                                                                \
+     [BENCH_SHIFT] = I_SHIFT_BY + (shifts),                                                                            \
+     [BENCH_SHUFFLE] = REST_SHUFFLES + I_UNPACK_PAIRS + (shuffles),                                                    \
+     [BENCH_LOAD] = REST_LOADS + RULES_LIMITS,                                                                         \
+     [BENCH_STORE] = REST_STORES}
 
 static const bench_loop loops[] = {
     {"fma_f32", LOOP_TIMES *F_LANES, loop_fma},

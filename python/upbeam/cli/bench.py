@@ -11,9 +11,7 @@ import typer
 from upbeam.kernels.opencl import OpenClError, list_devices
 from upbeam.power.bench.bench import Benchmark, Settings, benchmark
 from upbeam.power.bench.peers import PEERS
-from upbeam.power.bench.plot import plot_times
 from upbeam.power.bench.tables import BenchTable, tables
-from upbeam.power.report import Picture, page_template
 from upbeam.runtime.upsampler import Model, load_model
 
 from .common import JsonOption, UserError, emit_json, err, message, show, table
@@ -111,6 +109,9 @@ def _show_devices(as_json: bool) -> None:
 
 def _write_report(folder: Path, run: Benchmark, result: dict[str, Any]) -> None:
     import json
+
+    from upbeam.power.bench.plot import plot_times
+    from upbeam.power.report import Picture, page_template
 
     folder.mkdir(parents=True, exist_ok=True)
     png = plot_times(run)
