@@ -254,12 +254,7 @@ def upsample_reference(
 
     The image is azimuth aligned; its ends are edges unless ``wrap``. Even rows are the input's, to the bit.
     """
-    d = np.asarray(distance, dtype=np.uint16)
-    i = np.asarray(intensity, dtype=np.uint8)
-    if d.ndim != 2 or d.shape[0] < 2 or i.shape != d.shape:
-        raise RulesError(
-            f"distance {list(d.shape)} and intensity {list(i.shape)} must be equal shapes [beams, columns]"
-        )
+    d, i = image_pair(distance, intensity)
     windows = extract_windows(d, i, rules, wrap=wrap)
     unit = rules.distance_unit_m
     generated = generated_counts(networks[0](windows.distance * unit) / unit, windows, rules)
@@ -268,13 +263,28 @@ def upsample_reference(
     return interleave_rows(d, generated, rules), interleave_rows(i, shade, rules)
 
 
+def image_pair(distance: ArrayLike, intensity: ArrayLike) -> tuple[U16, U8]:
+    """Both images as arrays of one shape. Raises RulesError."""
+    d = np.asarray(distance, dtype=np.uint16)
+    i = np.asarray(intensity, dtype=np.uint8)
+    if d.ndim != 2 or d.shape[0] < 2 or i.shape != d.shape:
+        raise RulesError(
+            f"distance {list(d.shape)} and intensity {list(i.shape)} must be equal shapes [beams, columns]"
+        )
+    return d, i
+
+
 def generated_counts(y_counts: FloatArray, windows: Windows, rules: Rules) -> U16:
     """Network outputs in counts -> generated counts: rounded half up, 0 outside the limits or without any return."""
-    rounded = np.floor(y_counts + 0.5)
-    keep = rules.given(rounded)
+    return kept_counts(np.floor(y_counts + 0.5), windows, rules)
+
+
+def kept_counts(whole: FloatArray | NDArray[np.int64], windows: Windows, rules: Rules) -> U16:
+    """Whole counts -> generated counts: 0 outside the limits or without any return."""
+    keep = rules.given(whole)
     if rules.empty == "fill":
         keep &= windows.any_return
-    return np.where(keep, rounded, 0).astype(np.uint16)
+    return np.where(keep, whole, 0).astype(np.uint16)
 
 
 def interleave_rows(rows: NDArray[T], generated: NDArray[T], rules: Rules) -> NDArray[T]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from upbeam.model.network import WINDOW
-from upbeam.model.rules import U8, U16, BoolArray, Rules, RulesError, extract_windows, interleave_rows
+from upbeam.model.rules import U8, U16, Rules, extract_windows, image_pair, interleave_rows, kept_counts
 
 __all__ = [
     "CONTRACTS",
@@ -179,25 +179,13 @@ def upsample_integer(
     distance: ArrayLike, intensity: ArrayLike, model: IntegerModel, rules: Rules, *, wrap: bool = False
 ) -> tuple[U16, U8]:
     """Counts and intensities ``[32, W]`` -> ``[64, W]``, as ``upsample_reference`` does in float."""
-    d = np.asarray(distance, dtype=np.uint16)
-    i = np.asarray(intensity, dtype=np.uint8)
-    if d.ndim != 2 or d.shape[0] < 2 or i.shape != d.shape:
-        raise RulesError(
-            f"distance {list(d.shape)} and intensity {list(i.shape)} must be equal shapes [beams, columns]"
-        )
+    d, i = image_pair(distance, intensity)
     windows = extract_windows(d, i, rules, wrap=wrap)
     far = network(model.distance, model.precision, windows.distance)
     grey = network(model.intensity, model.precision, windows.intensity)
-    generated = generated_distance(far, windows.any_return, rules)
+    generated = kept_counts(far.y, windows, rules)
     shade = np.where(generated > 0, np.clip(grey.y, 0, LARGEST_INTENSITY), 0).astype(np.uint8)
     return interleave_rows(d, generated, rules), interleave_rows(i, shade, rules)
-
-
-def generated_distance(trace: Trace, any_return: BoolArray, rules: Rules) -> U16:
-    keep = rules.given(trace.y)
-    if rules.empty == "fill":
-        keep &= any_return
-    return np.where(keep, trace.y, 0).astype(np.uint16)
 
 
 # -------------------------------------------------------------------------------------------------- the proof
