@@ -60,7 +60,7 @@ typedef struct inputs {
     int16x8_t x[UPB_TAPS];
 } inputs;
 
-UPB_INLINE inputs signed_inputs(const upb_network_int *net, const V x[UPB_TAPS]) {
+UPB_INLINE inputs inputs_of(const upb_network_int *net, const V x[UPB_TAPS]) {
     inputs in;
     for (int i = 0; i < UPB_TAP_MINIMUM; i++)
         in.x[i] = vreinterpretq_s16_u16(x[i]);
@@ -78,15 +78,9 @@ UPB_INLINE W layers_words(const upb_network_int *net, const inputs *in, int32_t 
     return output;
 }
 
-UPB_INLINE W network_words(const upb_network_int *net, const inputs *in, V minimum) {
-    return finish_output(net, net->slope ? layers_words(net, in, net->slope) : layers_words(net, in, 0), minimum);
-}
-
-UPB_INLINE void networks_int16(W y[2], const upb_network_int networks[2], V x[2][UPB_TAPS]) {
-    /* No loop: compilers leave it rolled, and then keep the inputs in memory. */
-    const inputs distance = signed_inputs(&networks[0], x[0]), intensity = signed_inputs(&networks[1], x[1]);
-    y[0] = network_words(&networks[0], &distance, window_minimum(&networks[0], x[0]));
-    y[1] = network_words(&networks[1], &intensity, window_minimum(&networks[1], x[1]));
+UPB_INLINE W output_of(const upb_network_int *net, const inputs *in, const V x[UPB_TAPS]) {
+    return finish_output(net, net->slope ? layers_words(net, in, net->slope) : layers_words(net, in, 0),
+                         window_minimum(net, x));
 }
 
 #ifdef UPB_DOT

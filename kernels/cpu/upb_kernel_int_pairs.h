@@ -35,7 +35,7 @@ static inline V window_minimum(const upb_network_int *net, const V x[UPB_TAPS]) 
 }
 
 /* Unsigned becomes signed, 32768 less: bias_signed makes up for it. */
-UPB_INLINE inputs pair_inputs(const upb_network_int *net, const V x[UPB_TAPS]) {
+UPB_INLINE inputs inputs_of(const upb_network_int *net, const V x[UPB_TAPS]) {
     const V least = window_minimum(net, x);
     const V last = V_XOR(net->j ? V_SHIFT_LEFT(least, net->j) : least, V_SET(0x8000u));
     inputs in;
@@ -67,7 +67,7 @@ UPB_INLINE void layers(I *output, const upb_network_int *net, const inputs *in, 
         }
 }
 
-UPB_INLINE W network(const upb_network_int *net, const inputs *in, V minimum) {
+UPB_INLINE W output_of(const upb_network_int *net, const inputs *in, const V x[UPB_TAPS]) {
     W y;
     for (int half = 0; half < 2; half += HALVES)
         if (net->slope)
@@ -76,12 +76,5 @@ UPB_INLINE W network(const upb_network_int *net, const inputs *in, V minimum) {
             layers(y.half, net, in, half, 0);
     for (int half = 0; half < 2; half++)
         y.half[half] = I_SHIFT_RIGHT32(y.half[half], net->t);
-    return W_ADD_V(y, net->skip ? minimum : V_SET(0));
-}
-
-UPB_INLINE void networks_int16(W y[2], const upb_network_int networks[2], V x[2][UPB_TAPS]) {
-    /* No loop: compilers leave it rolled, and then keep the inputs in memory. */
-    const inputs distance = pair_inputs(&networks[0], x[0]), intensity = pair_inputs(&networks[1], x[1]);
-    y[0] = network(&networks[0], &distance, window_minimum(&networks[0], x[0]));
-    y[1] = network(&networks[1], &intensity, window_minimum(&networks[1], x[1]));
+    return W_ADD_V(y, net->skip ? window_minimum(net, x) : V_SET(0));
 }

@@ -2,9 +2,10 @@
  * The integer window kernels in vectors: included once by each instruction set's file, which includes its
  * upb_vectors_*.h and defines before
  *
- *   networks_int16(y, networks, x)  y of both networks, W[2]; x: differences and minimum, V[2][UPB_TAPS], all shifted
- *                                   left by k of their network, differences with the highest bit flipped: signed
- *                                   numbers, 32768 less
+ *   inputs               what the networks of one vector of windows start from
+ *   inputs_of(net, x)    of differences and minimum, V[UPB_TAPS], all shifted left by k of the network, differences
+ *                        with the highest bit flipped: signed numbers, 32768 less
+ *   output_of(net, in, x)  y of a network, W
  *   UPB_FILL_KERNELS     the name of the function that hands the kernels out
  *
  * and, if its int8 has instructions of its own, HAS_NETWORKS_INT8 and networks_int8(y, networks, x), whose differences
@@ -35,28 +36,36 @@ static void prepare_int(upb_prepared_int *prepared, const upb_model_int *model, 
             distance, intensity);
 }
 
+/* No loop over the networks: compilers leave it rolled, and then keep the inputs in memory. */
+UPB_INLINE void networks_int16(W y[2], const upb_network_int networks[2], V x[2][UPB_TAPS]) {
+    const inputs distance = inputs_of(&networks[0], x[0]), intensity = inputs_of(&networks[1], x[1]);
+    y[0] = output_of(&networks[0], &distance, x[0]);
+    y[1] = output_of(&networks[1], &intensity, x[1]);
+}
+
 #ifndef HAS_NETWORKS_INT8
 /*
  * Step 3 of int8: differences become q << s, their sign bit flipped. Intensities fit eight bits as they are. The shift
- * s is never needed as such: with `half`, 2^(s-1) or 0, rounding is to add half and to clear the bits below 2^s. What
- * saturates at 65535 is 255 << 8 as well. That differences come shifted by k changes nothing: s is then larger by up to
- * k, and the bits below 2^k are 0.
+ * s is never needed as such: with `below`, 2^s - 1, rounding is to add half of 2^s and to clear the bits below it. What
+ * would become 256 << s is cut to one less before: then it becomes 255 << s. That differences come shifted by k changes
+ * nothing: s is then larger by up to k, and the bits below 2^k are 0.
  */
 UPB_INLINE void code_block(V x[UPB_TAPS]) {
-    const V any = V_OR(V_OR(V_OR(x[0], x[1]), V_OR(x[2], x[3])), V_OR(x[4], x[5])); /* as long as the largest */
-    const V half = V_TOP_BIT(V_SHIFT_RIGHT(any, 8)), step = V_MAX(V_SHIFT_LEFT(half, 1), V_SET(1));
-    const V above = V_SUB(V_SET(0), step), sign = V_SET(SIGN_BIT);
-    const V largest = V_XOR(V_SUB(V_SHIFT_LEFT(step, 8), step), sign);
+    const V any = V_OR(V_OR3(x[0], x[1], x[2]), V_OR3(x[3], x[4], x[5])); /* as long as the largest */
+    const V smeared = V_SMEAR_UPPER(any), below = V_SHIFT_RIGHT(smeared, 8), half = V_AVERAGE(below, V_SET(0));
+    const V largest = V_OR(smeared, V_SET(0xff)); /* (256 << s) - 1 */
     for (int i = 0; i < UPB_TAP_MINIMUM; i++)
-        x[i] = V_MIN_SIGNED(V_AND_XOR(V_ADD_SAT(x[i], half), above, sign), largest);
+        x[i] = V_CLEAR_XOR(V_MIN(V_ADD_SAT(x[i], half), largest), below, V_SET(SIGN_BIT));
 }
 
 static const uint16_t int8_lift[2] = {0, SIGN_BIT};
 
-/* On 16-bit instructions. */
+/* On 16-bit instructions. Intensities first: their sums are work while distances are coded. */
 UPB_INLINE void networks_int8(W y[2], const upb_network_int networks[2], V x[2][UPB_TAPS]) {
     code_block(x[UPB_DISTANCE]);
-    networks_int16(y, networks, x);
+    const inputs distance = inputs_of(&networks[0], x[0]), intensity = inputs_of(&networks[1], x[1]);
+    y[1] = output_of(&networks[1], &intensity, x[1]);
+    y[0] = output_of(&networks[0], &distance, x[0]);
 }
 #endif
 

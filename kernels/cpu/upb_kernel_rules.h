@@ -9,13 +9,14 @@
  *   V_LOAD_U8(p), V_STORE_U8(p, v)   the same of u8, unaligned; v is at most 255
  *   V_LOAD_FLOATS(p)     V_LANES aligned floats, whole and in range
  *   V_SET(x)             all lanes x
- *   V_ADD_SAT, V_SUB, V_AND, V_OR, V_XOR, V_MIN, V_MAX (a, b);   V_SHIFT_LEFT, V_SHIFT_RIGHT(v, n), n in 0..16
+ *   V_ADD_SAT, V_SUB, V_AND, V_OR, V_XOR, V_MIN (a, b);   V_SHIFT_LEFT, V_SHIFT_RIGHT(v, n), n in 0..16
  *   V_NEXT(a, b)         lanes 1.. of a, then lane 0 of b
- *   V_TOP_BIT(v)         the highest bit of each lane alone, 0 of 0; v is at most 255
+ *   V_SMEAR_UPPER(v)     in the upper byte of each lane, its highest bit set and all below (0 of 0); in the lower one,
+ *                        anything
  *   M_ALL(yes)           yes or no, 1 or 0, for all lanes
  *   M_IS_ZERO(v), M_AT_LEAST(a, b): a >= b, M_AND(m, n), M_AND_NOT(m, n): m and not n
  *   V_SELECT(m, yes, no), V_KEEP(m, v): v or 0, V_MIN_WHERE(m, a, b, no): the less one or no
- *   V_AND_XOR(a, b, c)   (a & b) ^ c;     V_MIN_SIGNED(a, b): of signed numbers
+ *   V_OR3(a, b, c);      V_CLEAR_XOR(a, b, c): (a & ~b) ^ c;     V_AVERAGE(a, b): (a + b + 1) >> 1
  *   W_MINUS_1(w), W_ADD_V(w, v): w + v, V_FROM_W(w): signed, what does not fit u16 is saturated
  *
  * The plain C kernels say the same one lane at a time: read those first.

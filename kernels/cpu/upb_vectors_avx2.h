@@ -29,13 +29,12 @@ static inline void store_u8(uint8_t *p, V v) {
 
 static inline V next_lanes(V a, V b) { return _mm256_alignr_epi8(_mm256_permute2x128_si256(a, b, 0x21), a, 2); }
 
-/* By half bytes: the highest bit of the upper one, if any, is greater than that of the lower. */
-static inline V top_bit(V v) {
-    const V of_low = _mm256_setr_epi8(0, 1, 2, 2, 4, 4, 4, 4, 8, 8, 8, 8, 8, 8, 8, 8, /* the same again */
-                                      0, 1, 2, 2, 4, 4, 4, 4, 8, 8, 8, 8, 8, 8, 8, 8);
-    const V of_high = _mm256_slli_epi16(of_low, 4);
-    const V low = _mm256_shuffle_epi8(of_low, _mm256_and_si256(v, _mm256_set1_epi16(15)));
-    return _mm256_max_epu8(low, _mm256_shuffle_epi8(of_high, _mm256_srli_epi16(v, 4)));
+/* By half bytes. Of a byte from 128 on, the lower half is looked up as 0: the upper one says all. */
+static inline V smear_upper(V v) {
+    const V of_low = _mm256_broadcastsi128_si256(_mm_setr_epi8(0, 1, 3, 3, 7, 7, 7, 7, 15, 15, 15, 15, 15, 15, 15, 15));
+    const V of_high =
+        _mm256_broadcastsi128_si256(_mm_setr_epi8(0, 31, 63, 63, 127, 127, 127, 127, -1, -1, -1, -1, -1, -1, -1, -1));
+    return _mm256_or_si256(_mm256_shuffle_epi8(of_low, v), _mm256_shuffle_epi8(of_high, _mm256_srli_epi16(v, 4)));
 }
 
 static inline V load_floats(const float *p) {
@@ -67,14 +66,14 @@ static inline W add_words(W w, V v) {
 #define V_AND(a, b) _mm256_and_si256(a, b)
 #define V_OR(a, b) _mm256_or_si256(a, b)
 #define V_XOR(a, b) _mm256_xor_si256(a, b)
-#define V_AND_XOR(a, b, c) V_XOR(V_AND(a, b), c)
-#define V_MIN_SIGNED(a, b) _mm256_min_epi16(a, b)
+#define V_OR3(a, b, c) V_OR(V_OR(a, b), c)
+#define V_CLEAR_XOR(a, b, c) V_XOR(_mm256_andnot_si256(b, a), c)
+#define V_AVERAGE(a, b) _mm256_avg_epu16(a, b)
 #define V_MIN(a, b) _mm256_min_epu16(a, b)
-#define V_MAX(a, b) _mm256_max_epu16(a, b)
 #define V_SHIFT_LEFT(v, n) _mm256_sll_epi16(v, _mm_cvtsi32_si128((int)(n)))
 #define V_SHIFT_RIGHT(v, n) _mm256_srl_epi16(v, _mm_cvtsi32_si128((int)(n)))
 #define V_NEXT(a, b) next_lanes(a, b)
-#define V_TOP_BIT(v) top_bit(v)
+#define V_SMEAR_UPPER(v) smear_upper(v)
 #define M_ALL(yes) _mm256_set1_epi32(-(yes))
 #define M_IS_ZERO(v) _mm256_cmpeq_epi16(v, _mm256_setzero_si256())
 #define M_AT_LEAST(a, b) _mm256_cmpeq_epi16(_mm256_max_epu16(a, b), a)

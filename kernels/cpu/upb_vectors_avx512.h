@@ -27,12 +27,12 @@ static inline V next_lanes(V a, V b) {
     return _mm512_permutex2var_epi16(a, _mm512_load_si512(next), b);
 }
 
-/* By half bytes: the highest bit of the upper one, if any, is greater than that of the lower. */
-static inline V top_bit(V v) {
-    const V of_low = _mm512_broadcast_i32x4(_mm_setr_epi8(0, 1, 2, 2, 4, 4, 4, 4, 8, 8, 8, 8, 8, 8, 8, 8));
-    const V of_high = _mm512_slli_epi16(of_low, 4);
-    const V low = _mm512_shuffle_epi8(of_low, _mm512_and_si512(v, _mm512_set1_epi16(15)));
-    return _mm512_max_epu8(low, _mm512_shuffle_epi8(of_high, _mm512_srli_epi16(v, 4)));
+/* By half bytes. Of a byte from 128 on, the lower half is looked up as 0: the upper one says all. */
+static inline V smear_upper(V v) {
+    const V of_low = _mm512_broadcast_i32x4(_mm_setr_epi8(0, 1, 3, 3, 7, 7, 7, 7, 15, 15, 15, 15, 15, 15, 15, 15));
+    const V of_high =
+        _mm512_broadcast_i32x4(_mm_setr_epi8(0, 31, 63, 63, 127, 127, 127, 127, -1, -1, -1, -1, -1, -1, -1, -1));
+    return _mm512_or_si512(_mm512_shuffle_epi8(of_low, v), _mm512_shuffle_epi8(of_high, _mm512_srli_epi16(v, 4)));
 }
 
 static inline V load_floats(const float *p) {
@@ -65,14 +65,14 @@ static inline W add_words(W w, V v) {
 #define V_AND(a, b) _mm512_and_si512(a, b)
 #define V_OR(a, b) _mm512_or_si512(a, b)
 #define V_XOR(a, b) _mm512_xor_si512(a, b)
-#define V_AND_XOR(a, b, c) _mm512_ternarylogic_epi32(a, b, c, 0x6a)
-#define V_MIN_SIGNED(a, b) _mm512_min_epi16(a, b)
+#define V_OR3(a, b, c) _mm512_ternarylogic_epi32(a, b, c, 0xfe)
+#define V_CLEAR_XOR(a, b, c) _mm512_ternarylogic_epi32(a, b, c, 0x9a)
+#define V_AVERAGE(a, b) _mm512_avg_epu16(a, b)
 #define V_MIN(a, b) _mm512_min_epu16(a, b)
-#define V_MAX(a, b) _mm512_max_epu16(a, b)
 #define V_SHIFT_LEFT(v, n) _mm512_sll_epi16(v, _mm_cvtsi32_si128((int)(n)))
 #define V_SHIFT_RIGHT(v, n) _mm512_srl_epi16(v, _mm_cvtsi32_si128((int)(n)))
 #define V_NEXT(a, b) next_lanes(a, b)
-#define V_TOP_BIT(v) top_bit(v)
+#define V_SMEAR_UPPER(v) smear_upper(v)
 #define M_ALL(yes) ((__mmask32)(0u - (unsigned)(yes)))
 #define M_IS_ZERO(v) _mm512_testn_epi16_mask(v, v)
 #define M_AT_LEAST(a, b) _mm512_cmpge_epu16_mask(a, b)

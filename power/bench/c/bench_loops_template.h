@@ -93,18 +93,14 @@ enum {
     I_UNPACK_PAIRS = 2 * 2 * 4,
     I_SHIFT_BY = 1 + 1 + 1 + 2 * 2, /* of intensities: by k, the minimum back and by j; both outputs by t */
     /* the block code of int8, of distances only */
-    CODE_OR = 5, /* as long as the largest */
-    CODE_SHIFT = 3,
-    CODE_TOP_LOGIC = 1, /* V_TOP_BIT: two halves of a byte looked up, the greater one */
-    CODE_TOP_SHIFT = 1,
-    CODE_TOP_SHUFFLE = 2,
-    CODE_TOP_MAX = 1,
-    CODE_MAX = 1,
-    CODE_SUB = 2,
-    CODE_XOR = 1,
-    CODE_ADD_SAT = 6, /* each difference: half a step, cleared and signed, saturated */
-    CODE_AND_XOR = 6,
-    CODE_MIN_SIGNED = 6
+    CODE_OR3 = 2,        /* as long as the largest */
+    CODE_OR = 1 + 1 + 1, /* the same; V_SMEAR_UPPER: two halves of a byte looked up; the largest code */
+    CODE_SHIFT = 1 + 1,
+    CODE_LOOK_UP = 2,
+    CODE_AVERAGE = 1,
+    CODE_ADD_SAT = 6, /* each difference: half a step, saturated, cleared and signed */
+    CODE_MIN = 6,
+    CODE_CLEAR_XOR = 6
 };
 
 /*
@@ -205,13 +201,13 @@ static inline const void *any_memory(void) {
 #define DO_MIN_WHERE(v) DO_V(v, V_MIN_WHERE(MASK, AS_I(x), in, AS_I(y)))
 #define DO_KEEP(v) DO_V(v, V_KEEP(MASK, in))
 #define DO_MIN(v) DO_V(v, V_MIN(in, AS_I(x)))
-#define DO_MAX(v) DO_V(v, V_MAX(in, AS_I(x)))
-#define DO_MIN_SIGNED(v) DO_V(v, V_MIN_SIGNED(in, AS_I(x)))
 #define DO_SUB(v) DO_V(v, V_SUB(in, AS_I(x)))
 #define DO_ADD_SAT(v) DO_V(v, V_ADD_SAT(in, AS_I(x)))
 #define DO_ADD32(v) DO_V(v, I_ADD32(in, AS_I(x)))
 #define DO_LOGIC(v) DO_V(v, V_XOR(in, AS_I(x)))
-#define DO_AND_XOR(v) DO_V(v, V_AND_XOR(in, AS_I(x), AS_I(y)))
+#define DO_OR3(v) DO_V(v, V_OR3(in, AS_I(x), AS_I(y)))
+#define DO_CLEAR_XOR(v) DO_V(v, V_CLEAR_XOR(in, AS_I(x), AS_I(y)))
+#define DO_AVERAGE(v) DO_V(v, V_AVERAGE(in, AS_I(x)))
 #define DO_SHIFT(v) DO_V(v, V_SHIFT_LEFT(in, 1))
 #define DO_SHIFT_BY(v) DO_V(v, V_SHIFT_LEFT(in, shift))
 #define DO_UNPACK(v) DO_V(v, I_UNPACK(in, AS_I(x)))
@@ -362,14 +358,14 @@ static void mix_int8(uint64_t blocks, uint32_t plain, uint32_t leaky) {
     RULES_START
     while (blocks--) {
         I_REST(I_LIFT8)
-        TIMES(CODE_OR + CODE_TOP_LOGIC + CODE_XOR, DO_LOGIC)
-        TIMES(CODE_SHIFT + CODE_TOP_SHIFT, DO_SHIFT)
-        TIMES(CODE_TOP_SHUFFLE, DO_LOOK_UP)
-        TIMES(CODE_TOP_MAX + CODE_MAX, DO_MAX)
-        TIMES(CODE_SUB, DO_SUB)
+        TIMES(CODE_OR3, DO_OR3)
+        TIMES(CODE_OR, DO_LOGIC)
+        TIMES(CODE_SHIFT, DO_SHIFT)
+        TIMES(CODE_LOOK_UP, DO_LOOK_UP)
+        TIMES(CODE_AVERAGE, DO_AVERAGE)
         TIMES(CODE_ADD_SAT, DO_ADD_SAT)
-        TIMES(CODE_AND_XOR, DO_AND_XOR)
-        TIMES(CODE_MIN_SIGNED, DO_MIN_SIGNED)
+        TIMES(CODE_MIN, DO_MIN)
+        TIMES(CODE_CLEAR_XOR, DO_CLEAR_XOR)
         I_ALL_PAIRS
     }
 }
@@ -436,8 +432,8 @@ static const bench_mix mixes[] = {
      V_LANES,
      I_PAIR_COUNTS,
      {[BENCH_MULTIPLY] = I_LEAKY_SCALE},
-     I_REST_COUNTS(CODE_OR + CODE_TOP_LOGIC + CODE_XOR + CODE_AND_XOR, CODE_SHIFT + CODE_TOP_SHIFT, CODE_TOP_SHUFFLE,
-                   CODE_TOP_MAX + CODE_MAX + CODE_MIN_SIGNED, I_LIFT8 + CODE_SUB + CODE_ADD_SAT),
+     I_REST_COUNTS(CODE_OR3 + CODE_OR + CODE_CLEAR_XOR, CODE_SHIFT, CODE_LOOK_UP, CODE_MIN,
+                   I_LIFT8 + CODE_AVERAGE + CODE_ADD_SAT),
      mix_int8},
 };
 
