@@ -14,6 +14,18 @@
 #define FUSED(a, b, c) ((a) * (b) + (c))
 #endif
 
+static void collect_c(uint16_t *distance, uint8_t *intensity, const upb_beam_source *source, uint32_t sources) {
+    for (unsigned k = 0; k < UPB_BEAMS; k++) {
+        distance[k] = 0;
+        intensity[k] = 0;
+        for (uint32_t s = 0; s < sources; s++)
+            if (source[s].beams >> k & 1) {
+                distance[k] = source[s].distance[k];
+                intensity[k] = source[s].intensity[k];
+            }
+    }
+}
+
 static int is_seen(const upb_model_f32 *model, unsigned beam, uint16_t distance) {
     return (float)distance >= model->min_count && (float)distance <= model->seen_max[beam];
 }
@@ -124,6 +136,7 @@ static void raw_f32_c(const upb_model_f32 *model, const upb_prepared_f32 *left, 
 }
 
 void UPB_FILL_KERNELS(upb_kernels *kernels) {
+    kernels->collect = collect_c;
     kernels->prepare_f32 = prepare_f32_c;
     kernels->windows_f32 = windows_f32_c;
     kernels->raw_f32 = raw_f32_c;

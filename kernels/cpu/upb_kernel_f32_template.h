@@ -27,6 +27,10 @@ UPB_INLINE limits limits_of(const upb_model_f32 *model) {
     return of;
 }
 
+static void collect_columns(uint16_t *distance, uint8_t *intensity, const upb_beam_source *source, uint32_t sources) {
+    collect(distance, intensity, source, sources);
+}
+
 static void prepare_f32(upb_prepared_f32 *prepared, const upb_model_f32 *model, const uint16_t *distance,
                         const uint8_t *intensity) {
     const limits of = limits_of(model);
@@ -124,6 +128,7 @@ static void raw_f32(const upb_model_f32 *model, const upb_prepared_f32 *left, co
 }
 
 void UPB_FILL_KERNELS(upb_kernels *kernels) {
+    kernels->collect = collect_columns;
     kernels->prepare_f32 = prepare_f32;
     kernels->windows_f32 = windows_f32;
     kernels->raw_f32 = raw_f32;

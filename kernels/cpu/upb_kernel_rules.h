@@ -13,7 +13,7 @@
  *   V_NEXT(a, b)         lanes 1.. of a, then lane 0 of b
  *   V_SMEAR_UPPER(v)     in the upper byte of each lane, its highest bit set and all below (0 of 0); in the lower one,
  *                        anything
- *   M_ALL(yes)           yes or no, 1 or 0, for all lanes
+ *   M_ALL(yes)           yes or no, 1 or 0, for all lanes;     M_BITS(bits): bit k of a uint32_t for lane k
  *   M_IS_ZERO(v), M_AT_LEAST(a, b): a >= b, M_AND(m, n), M_AND_NOT(m, n): m and not n
  *   V_SELECT(m, yes, no), V_KEEP(m, v): v or 0, V_MIN_WHERE(m, a, b, no): the less one or no
  *   V_OR3(a, b, c);      V_CLEAR_XOR(a, b, c): (a & ~b) ^ c;     V_AVERAGE(a, b): (a + b + 1) >> 1
@@ -33,6 +33,19 @@ typedef struct limits {
     V seen_max[V_BLOCKS], given_max[V_BLOCKS], min_count;
     M fill; /* UPB_EMPTY_FILL */
 } limits;
+
+UPB_INLINE void collect(uint16_t *distance, uint8_t *intensity, const upb_beam_source *source, uint32_t sources) {
+    for (unsigned k = 0; k < UPB_LANES; k += V_LANES) {
+        V d = V_SET(0), i = V_SET(0);
+        for (uint32_t s = 0; s < sources; s++) {
+            const M here = M_BITS(source[s].beams >> k);
+            d = V_SELECT(here, V_LOADU(source[s].distance + k), d);
+            i = V_SELECT(here, V_LOAD_U8(source[s].intensity + k), i);
+        }
+        V_STOREU(distance + k, d);
+        V_STORE_U8(intensity + k, i);
+    }
+}
 
 /* shift: left shift of the values of each network; it leaves 0 to be 0, and the order. */
 UPB_INLINE void prepare(upb_prepared *prepared, const limits *of, const uint32_t shift[2], const uint16_t *distance,

@@ -47,6 +47,20 @@ typedef struct upb_network_f32 {
 
 enum { UPB_DISTANCE = 0, UPB_INTENSITY = 1 };
 
+/* Some beams of a column: distance and intensity are [UPB_BEAMS], no alignment needed; beams: bit k: beam k. */
+typedef struct upb_beam_source {
+    const uint16_t *distance;
+    const uint8_t *intensity;
+    uint32_t beams;
+} upb_beam_source;
+
+/*
+ * Makes one column, [UPB_BEAMS], of those beams of several; no beam is of two of them, and one of none is 0. It is
+ * written in the vectors that upb_prepare_* reads: a load across several stores would have to wait for them, and they
+ * for everything before them.
+ */
+typedef void (*upb_collect_fn)(uint16_t *distance, uint8_t *intensity, const upb_beam_source *source, uint32_t sources);
+
 /* What a kernel needs of a model. */
 typedef struct upb_model_f32 {
     upb_network_f32 network[2];                     /* UPB_DISTANCE, UPB_INTENSITY */
@@ -147,6 +161,7 @@ typedef struct upb_kernels {
     upb_prepare_int_fn prepare_int;
     upb_windows_int_fn windows_int16;
     upb_windows_int_fn windows_int8;
+    upb_collect_fn collect;
 } upb_kernels;
 
 /*
@@ -157,7 +172,7 @@ upb_cpu upb_kernels_select(upb_kernels *kernels, upb_cpu cpu);
 
 /*
  * Each in its own file, compiled with the flags of its instruction set: call only where the machine has it. They fill
- * in the float kernels, or with _int_ the integer ones.
+ * in the float kernels and `collect`, or with _int_ the integer ones.
  */
 void upb_kernels_fill_c(upb_kernels *kernels);
 void upb_kernels_fill_c_fma(upb_kernels *kernels);

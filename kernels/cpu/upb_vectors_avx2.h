@@ -37,6 +37,12 @@ static inline V smear_upper(V v) {
     return _mm256_or_si256(_mm256_shuffle_epi8(of_low, v), _mm256_shuffle_epi8(of_high, _mm256_srli_epi16(v, 4)));
 }
 
+static inline M mask_of_bits(uint32_t bits) {
+    const V lane = _mm256_setr_epi16(1, 1 << 1, 1 << 2, 1 << 3, 1 << 4, 1 << 5, 1 << 6, 1 << 7, 1 << 8, 1 << 9, 1 << 10,
+                                     1 << 11, 1 << 12, 1 << 13, 1 << 14, -32768);
+    return _mm256_cmpeq_epi16(_mm256_and_si256(_mm256_set1_epi16((int16_t)bits), lane), lane);
+}
+
 static inline V load_floats(const float *p) {
     const I low = _mm256_cvttps_epi32(_mm256_load_ps(p)), high = _mm256_cvttps_epi32(_mm256_load_ps(p + 8));
     return _mm256_permute4x64_epi64(_mm256_packus_epi32(low, high), 0xd8);
@@ -75,6 +81,7 @@ static inline W add_words(W w, V v) {
 #define V_NEXT(a, b) next_lanes(a, b)
 #define V_SMEAR_UPPER(v) smear_upper(v)
 #define M_ALL(yes) _mm256_set1_epi32(-(yes))
+#define M_BITS(bits) mask_of_bits(bits)
 #define M_IS_ZERO(v) _mm256_cmpeq_epi16(v, _mm256_setzero_si256())
 #define M_AT_LEAST(a, b) _mm256_cmpeq_epi16(_mm256_max_epu16(a, b), a)
 #define M_AND(m, n) _mm256_and_si256(m, n)

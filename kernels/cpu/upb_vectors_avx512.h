@@ -74,6 +74,7 @@ static inline W add_words(W w, V v) {
 #define V_NEXT(a, b) next_lanes(a, b)
 #define V_SMEAR_UPPER(v) smear_upper(v)
 #define M_ALL(yes) ((__mmask32)(0u - (unsigned)(yes)))
+#define M_BITS(bits) ((__mmask32)(bits))
 #define M_IS_ZERO(v) _mm512_testn_epi16_mask(v, v)
 #define M_AT_LEAST(a, b) _mm512_cmpge_epu16_mask(a, b)
 #define M_AND(m, n) ((m) & (n))

@@ -28,6 +28,11 @@ static inline W add_words(W w, V v) {
                 vreinterpretq_s32_u32(vaddw_high_u16(vreinterpretq_u32_s32(w.half[1]), v))}};
 }
 
+static inline M mask_of_bits(uint32_t bits) {
+    static const uint16_t lane[8] = {1, 2, 4, 8, 16, 32, 64, 128};
+    return vtstq_u16(vdupq_n_u16((uint16_t)bits), vld1q_u16(lane));
+}
+
 static inline V load_floats(const float *p) {
     return vmovn_high_u32(vmovn_u32(vcvtq_u32_f32(vld1q_f32(p))), vcvtq_u32_f32(vld1q_f32(p + 4)));
 }
@@ -54,6 +59,7 @@ static inline V load_floats(const float *p) {
 #define V_NEXT(a, b) vextq_u16(a, b, 1)
 #define V_SMEAR_UPPER(v) vshlq_u16(vdupq_n_u16(0xffff), vnegq_s16(vreinterpretq_s16_u16(vclzq_u16(v))))
 #define M_ALL(yes) vdupq_n_u16((uint16_t)(0 - (yes)))
+#define M_BITS(bits) mask_of_bits(bits)
 #define M_IS_ZERO(v) vceqzq_u16(v)
 #define M_AT_LEAST(a, b) vcgeq_u16(a, b)
 #define M_AND(m, n) vandq_u16(m, n)

@@ -14,23 +14,27 @@
 #define REORDER_COLUMNS 64u /* default: a few packets */
 #define GAP_TURNS_MAX 16u
 
-/* An azimuth column that is being filled. */
-typedef struct ring_slot {
-    uint32_t arrived; /* bit k: the firing column of beam k was received */
-    uint16_t distance[UPB_BEAMS];
-    uint8_t intensity[UPB_BEAMS];
-} ring_slot;
+/*
+ * The last firing columns, whose beams go to azimuth columns that are not complete: [slots] rows each, aligned to their
+ * size, since vectors are read from them.
+ */
+typedef struct column_ring {
+    uint16_t (*distance)[UPB_BEAMS];
+    uint8_t (*intensity)[UPB_BEAMS];
+    uint32_t *received; /* 0: the column never arrived, and its rows mean nothing */
+} column_ring;
+
+enum { RING_COLUMN_BYTES = UPB_BEAMS * (sizeof(uint16_t) + sizeof(uint8_t)) + sizeof(uint32_t) };
 
 /* How azimuth offsets become a ring. */
 typedef struct destagger {
-    int32_t shift;  /* azimuth column of firing column j: j + shift + (0 at beam_slot = delay) */
-    uint32_t slots; /* azimuth columns that fill at the same time; 1: no ring is needed */
+    int32_t shift;  /* azimuth column of firing column j: j + shift + (0 at group_age = delay) */
+    uint32_t slots; /* firing columns that an azimuth column is made of lie within as many; 1: no ring is needed */
     uint32_t delay; /* firing columns from a column to its last beam */
-    /* Beams of the same offset go to the same slot: */
+    /* Beams of the same offset come from the same firing column: */
     uint32_t groups;
     uint32_t group_beams[UPB_BEAMS]; /* bit k: beam k */
-    uint16_t group_slot[UPB_BEAMS];  /* slots ahead of the oldest one */
-    uint8_t beam_group[UPB_BEAMS];
+    uint16_t group_age[UPB_BEAMS];   /* firing columns before the one that completes the azimuth column */
 } destagger;
 
 /* Place of an azimuth column. */
@@ -46,6 +50,7 @@ enum { PREPARED_COLUMNS = 4, EMPTY_COLUMN = 3 };
 struct upb_stream {
     _Alignas(UPB_ALIGN) uint16_t out_distance[UPB_ROWS];
     uint8_t out_intensity[UPB_ROWS];
+    upb_collect_fn collect;
     upb_prepare_f32_fn prepare_f32;
     upb_windows_f32_fn windows_f32;
     upb_prepare_int_fn prepare_int;
@@ -64,8 +69,8 @@ struct upb_stream {
     uint32_t started;     /* a firing column was taken */
     uint32_t last_column; /* the last one, inserted ones included */
     uint32_t waiting;     /* firing columns still to come before the segment's first azimuth column is complete */
-    uint32_t oldest;      /* ring slot of the next azimuth column to complete */
-    ring_slot *ring;      /* beams.slots, none if that is 1 */
+    uint32_t newest;      /* place in the ring of the next firing column */
+    column_ring ring;     /* of beams.slots, nulls if that is 1 */
 
     /* azimuth columns of this segment */
     place next;     /* the next one to complete */
@@ -102,14 +107,13 @@ static uint32_t columns_of(const upb_model_info *info, const upb_stream_config *
     return config->columns ? config->columns : info->columns;
 }
 
-static void add_beam(destagger *plan, unsigned beam, uint16_t slot) {
+static void add_beam(destagger *plan, unsigned beam, uint16_t age) {
     uint32_t group = 0;
-    while (group < plan->groups && plan->group_slot[group] != slot)
+    while (group < plan->groups && plan->group_age[group] != age)
         group++;
     if (group == plan->groups)
-        plan->group_slot[plan->groups++] = slot;
+        plan->group_age[plan->groups++] = age;
     plan->group_beams[group] |= 1u << beam;
-    plan->beam_group[beam] = (uint8_t)group;
 }
 
 /*
@@ -133,7 +137,7 @@ static destagger plan_destagger(const upb_model_info *info, const upb_stream_con
     return plan;
 }
 
-static size_t ring_bytes(const destagger *plan) { return plan->slots > 1 ? plan->slots * sizeof(ring_slot) : 0; }
+static size_t ring_bytes(const destagger *plan) { return plan->slots > 1 ? plan->slots * RING_COLUMN_BYTES : 0; }
 
 static upb_status bad_argument(upb_error *error, const char *what, uint64_t got, uint64_t expected) {
     return upb_fail(error, UPB_E_ARGUMENT, what, 0, got, expected);
@@ -214,17 +218,28 @@ static const upb_prepared *empty_column(const upb_stream *stream) { return &stre
 static void begin_segment(upb_stream *stream, uint64_t frame) {
     stream->started = 0;
     stream->waiting = stream->beams.delay;
-    stream->oldest = 0;
+    stream->newest = 0;
     stream->next.frame = frame;
     stream->pending = 0;
     stream->left = empty_column(stream);
-    if (stream->ring)
-        memset(stream->ring, 0, ring_bytes(&stream->beams));
+    if (stream->ring.received)
+        memset(stream->ring.received, 0, stream->beams.slots * sizeof stream->ring.received[0]);
+}
+
+static column_ring place_ring(uint32_t slots, unsigned char *memory) {
+    column_ring ring = {0};
+    if (slots > 1) {
+        ring.distance = (uint16_t(*)[UPB_BEAMS])(void *)memory;
+        ring.intensity = (uint8_t(*)[UPB_BEAMS])(ring.distance + slots);
+        ring.received = (uint32_t *)(void *)(ring.intensity + slots);
+    }
+    return ring;
 }
 
 static void choose_kernels(upb_stream *s, const upb_stream_config *config) {
     upb_kernels kernels;
     s->stats.cpu = upb_kernels_select(&kernels, (upb_cpu)config->cpu);
+    s->collect = kernels.collect;
     s->prepare_f32 = kernels.prepare_f32;
     s->windows_f32 = kernels.windows_f32;
     s->prepare_int = kernels.prepare_int;
@@ -254,7 +269,7 @@ upb_status upb_stream_init(void *memory, size_t memory_bytes, const upb_model *m
         s->reorder_columns = s->columns / 2;
     s->beams = plan_destagger(&model->info, config);
     s->prepared = (upb_prepared *)(s + 1);
-    s->ring = s->beams.slots > 1 ? (ring_slot *)(s->prepared + PREPARED_COLUMNS) : NULL;
+    s->ring = place_ring(s->beams.slots, (unsigned char *)(s->prepared + PREPARED_COLUMNS));
     choose_kernels(s, config);
     s->stats.precision = config->precision;
     s->stats.delay_columns = s->beams.delay + 1;
@@ -355,30 +370,41 @@ static void take_azimuth_column(upb_stream *s, const uint16_t *distance, const u
 
 /* --------------------------------------------------------------------------------------- firing columns */
 
-/* Completes the oldest slot of the ring and empties it for the column that comes into reach. */
-static void complete_slot(upb_stream *s) {
-    ring_slot *slot = &s->ring[s->oldest];
-    if (s->waiting)
-        s->waiting--; /* a column before the segment's first one: outside the stream */
-    else
-        take_azimuth_column(s, slot->distance, slot->intensity, slot->arrived == ALL_BEAMS);
-    memset(slot, 0, sizeof *slot);
-    s->oldest = s->oldest + 1 == s->beams.slots ? 0 : s->oldest + 1;
+/* Where the beams of the azimuth column are that the firing column given completes; returns those that arrived. */
+static uint32_t find_beams(const upb_stream *s, upb_beam_source *source, const uint16_t *distance,
+                           const uint8_t *intensity) {
+    uint32_t arrived = 0;
+    for (uint32_t g = 0; g < s->beams.groups; g++) {
+        const uint32_t age = s->beams.group_age[g];
+        const uint32_t at = s->newest >= age ? s->newest - age : s->newest + s->beams.slots - age;
+        source[g].beams = s->ring.received[at] ? s->beams.group_beams[g] : 0;
+        source[g].distance = age ? s->ring.distance[at] : distance;
+        source[g].intensity = age ? s->ring.intensity[at] : intensity;
+        arrived |= source[g].beams;
+    }
+    return arrived;
 }
 
-static void scatter(upb_stream *s, const uint16_t *distance, const uint8_t *intensity) {
-    const uint32_t slots = s->beams.slots;
-    ring_slot *to[UPB_BEAMS];
-    for (uint32_t g = 0; g < s->beams.groups; g++) {
-        const uint32_t index = s->oldest + s->beams.group_slot[g];
-        to[g] = &s->ring[index < slots ? index : index - slots];
-        to[g]->arrived |= s->beams.group_beams[g];
+/* Takes the next firing column, null: it never arrived, and the azimuth column that it completes. */
+static void take_ring_column(upb_stream *s, const uint16_t *distance, const uint8_t *intensity) {
+    const uint32_t newest = s->newest;
+    s->ring.received[newest] = distance != NULL;
+    if (s->waiting)
+        s->waiting--; /* it completes a column before the segment's first one: outside the stream */
+    else {
+        _Alignas(UPB_ALIGN) uint16_t collected_distance[UPB_BEAMS];
+        _Alignas(UPB_ALIGN) uint8_t collected_intensity[UPB_BEAMS];
+        upb_beam_source source[UPB_BEAMS];
+        const uint32_t arrived =
+            find_beams(s, source, distance ? distance : no_distance, distance ? intensity : no_intensity);
+        s->collect(collected_distance, collected_intensity, source, s->beams.groups);
+        take_azimuth_column(s, collected_distance, collected_intensity, arrived == ALL_BEAMS);
     }
-    for (unsigned k = 0; k < UPB_BEAMS; k++) {
-        ring_slot *slot = to[s->beams.beam_group[k]];
-        slot->distance[k] = distance[k];
-        slot->intensity[k] = intensity[k];
+    if (distance) {
+        memcpy(s->ring.distance[newest], distance, sizeof s->ring.distance[newest]);
+        memcpy(s->ring.intensity[newest], intensity, sizeof s->ring.intensity[newest]);
     }
+    s->newest = newest + 1 == s->beams.slots ? 0 : newest + 1;
 }
 
 /* Takes the firing column that follows the last one; null: it never arrived. */
@@ -388,10 +414,8 @@ static void take_firing_column(upb_stream *s, const uint16_t *distance, const ui
         s->stats.columns_in++;
     else
         s->stats.columns_missing++;
-    if (s->ring) {
-        if (distance)
-            scatter(s, distance, intensity);
-        complete_slot(s);
+    if (s->ring.received) {
+        take_ring_column(s, distance, intensity);
     } else {
         take_azimuth_column(s, distance ? distance : no_distance, distance ? intensity : no_intensity,
                             distance != NULL);
@@ -442,7 +466,7 @@ upb_status upb_stream_flush(upb_stream *stream) {
     /* Columns up to the last firing column's; those beyond it, begun by beams that look ahead, are outside the stream.
      */
     for (uint32_t i = 0; i < stream->beams.delay; i++)
-        complete_slot(stream);
+        take_ring_column(stream, NULL, NULL);
     if (stream->pending)
         finish(stream, empty_column(stream));
     begin_segment(stream, stream->next.column == 0 ? stream->next.frame : stream->next.frame + 1);

@@ -263,6 +263,40 @@ static void check_by_hand(const upb_kernels *kernels) {
     CHECK_EQUAL(out.raw[0][3], 4 + 200);
 }
 
+/* ------------------------------------------------------------------------------------------- collecting */
+
+static void compare_collected(const upb_kernels *kernels, const raw_column *from, const uint8_t owner[UPB_BEAMS],
+                              const upb_beam_source *source, uint32_t sources) {
+    raw_column got;
+    memset(&got, 0xee, sizeof got);
+    kernels->collect(got.distance, got.intensity, source, sources);
+    for (unsigned k = 0; k < UPB_BEAMS; k++) {
+        const int is_some = owner[k] < sources;
+        CHECK_EQUAL(got.distance[k], is_some ? from[owner[k]].distance[k] : 0);
+        CHECK_EQUAL(got.intensity[k], is_some ? from[owner[k]].intensity[k] : 0);
+    }
+}
+
+/* Beams of a few columns or many, and some of none. */
+static void check_collect(const upb_kernels *kernels, random_source *random) {
+    raw_column from[UPB_BEAMS];
+    for (unsigned i = 0; i < UPB_BEAMS; i++)
+        pattern_column(random, i % PATTERNS, 1, 65535, &from[i]);
+    for (unsigned round = 0; round < 200; round++) {
+        const uint32_t sources = random_below(random, UPB_BEAMS + 1), owners = sources + random_below(random, 3);
+        upb_beam_source source[UPB_BEAMS];
+        uint8_t owner[UPB_BEAMS];
+        for (uint32_t i = 0; i < sources; i++)
+            source[i] = (upb_beam_source){from[i].distance, from[i].intensity, 0};
+        for (unsigned k = 0; k < UPB_BEAMS; k++) {
+            owner[k] = (uint8_t)(owners ? random_below(random, owners) : 0);
+            if (owner[k] < sources)
+                source[owner[k]].beams |= 1u << k;
+        }
+        compare_collected(kernels, from, owner, source, sources);
+    }
+}
+
 /* --------------------------------------------------------------------------------------------- benchmark */
 
 static double seconds_now(void) {
@@ -446,7 +480,7 @@ static const upb_model *load(const char *path) {
     return model;
 }
 
-/* Known answers and, if asked for, times of every instruction set. `required`: the name of one that must be there. */
+/* Known answers, collected columns and, if asked for, times of every instruction set. `required`: the name of one that must be there. */
 static void visit_cpus(const upb_model *model, int is_bench, const char *required, random_source random) {
     static bench_models models;
     choose_models(&models, model, &random);
@@ -458,6 +492,7 @@ static void visit_cpus(const upb_model *model, int is_bench, const char *require
             continue;
         }
         check_by_hand(&kernels);
+        check_collect(&kernels, &random);
         if (is_bench)
             bench((upb_cpu)cpu, &models, model, &random);
     }
