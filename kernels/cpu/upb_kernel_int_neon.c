@@ -120,13 +120,14 @@ UPB_INLINE void code(coded group[2], const upb_network_int *net, const V x[UPB_T
 /* Step 4 without the bias. */
 UPB_INLINE W unit_sum_bytes(const upb_network_int *net, uint32_t h, const coded group[2]) {
     const int8x8_t weights = vld1_s8(net->weight8[h]); /* of bytes that are none: 0 */
+    const int16x8_t words = vld1q_s16(net->weight[h]); /* a lane of a row: a copy to all lanes takes a vector unit */
     const int32x4_t begin = vdupq_n_s32(net->dot_signed[h]);
     W sum;
     for (int g = 0; g < 2; g++) {
         int32x4_t dot = vdotq_lane_s32(begin, group[g].first, weights, 0);
         dot = vdotq_lane_s32(dot, group[g].second, weights, 1);
         dot = vshlq_s32(dot, group[g].shift);
-        sum.half[g] = vmlal_n_s16(dot, group[g].minimum, net->weight[h][UPB_TAP_MINIMUM]);
+        sum.half[g] = vmlal_laneq_s16(dot, group[g].minimum, words, UPB_TAP_MINIMUM);
     }
     return sum;
 }
