@@ -1,6 +1,7 @@
 /* The window kernel in plain C: the reference that every other one is checked against, and the fallback. */
 #include <math.h>
 
+#include "upb_collect.h"
 #include "upb_kernels.h"
 
 #ifndef UPB_FILL_KERNELS
@@ -13,18 +14,6 @@
 #else
 #define FUSED(a, b, c) ((a) * (b) + (c))
 #endif
-
-static void collect_c(uint16_t *distance, uint8_t *intensity, const upb_beam_source *source, uint32_t sources) {
-    for (unsigned k = 0; k < UPB_BEAMS; k++) {
-        distance[k] = 0;
-        intensity[k] = 0;
-        for (uint32_t s = 0; s < sources; s++)
-            if (source[s].beams >> k & 1) {
-                distance[k] = source[s].distance[k];
-                intensity[k] = source[s].intensity[k];
-            }
-    }
-}
 
 static int is_seen(const upb_model_f32 *model, unsigned beam, uint16_t distance) {
     return (float)distance >= model->min_count && (float)distance <= model->seen_max[beam];
@@ -47,6 +36,12 @@ static void prepare_f32_c(upb_prepared_f32 *prepared, const upb_model_f32 *model
         prepared->row[UPB_INTENSITY_TOP][k] = i[top];
         prepared->row[UPB_INTENSITY_BOTTOM][k] = i[bottom];
     }
+}
+
+static void collect_f32_c(upb_prepared_f32 *prepared, const upb_model_f32 *model, const upb_beam_sources *sources,
+                          uint16_t *distance, uint8_t *intensity) {
+    collect_beams(distance, intensity, sources);
+    prepare_f32_c(prepared, model, distance, intensity);
 }
 
 static float least(float a, float b) { return a < b ? a : b; }
@@ -136,7 +131,7 @@ static void raw_f32_c(const upb_model_f32 *model, const upb_prepared_f32 *left, 
 }
 
 void UPB_FILL_KERNELS(upb_kernels *kernels) {
-    kernels->collect = collect_c;
+    kernels->collect_f32 = collect_f32_c;
     kernels->prepare_f32 = prepare_f32_c;
     kernels->windows_f32 = windows_f32_c;
     kernels->raw_f32 = raw_f32_c;

@@ -15,6 +15,7 @@
 #include "upb_kernel_rules.h"
 
 static const uint16_t unlifted[2];
+static const uint32_t unshifted[2];
 
 #define OUTPUT_MOST 1e6f /* more than any count: outputs are cut to it before they become integers */
 
@@ -27,14 +28,16 @@ UPB_INLINE limits limits_of(const upb_model_f32 *model) {
     return of;
 }
 
-static void collect_columns(uint16_t *distance, uint8_t *intensity, const upb_beam_source *source, uint32_t sources) {
-    collect(distance, intensity, source, sources);
-}
-
 static void prepare_f32(upb_prepared_f32 *prepared, const upb_model_f32 *model, const uint16_t *distance,
                         const uint8_t *intensity) {
     const limits of = limits_of(model);
-    prepare(prepared, &of, (const uint32_t[2]){0, 0}, distance, intensity);
+    prepare(prepared, &of, unshifted, load_rows(distance, intensity));
+}
+
+static void collect_f32(upb_prepared_f32 *prepared, const upb_model_f32 *model, const upb_beam_sources *sources,
+                        uint16_t *distance, uint8_t *intensity) {
+    const limits of = limits_of(model);
+    prepare(prepared, &of, unshifted, collect_rows(distance, intensity, sources));
 }
 
 /* y[half]: the output of a half of the windows less skip * minimum. */
@@ -128,8 +131,8 @@ static void raw_f32(const upb_model_f32 *model, const upb_prepared_f32 *left, co
 }
 
 void UPB_FILL_KERNELS(upb_kernels *kernels) {
-    kernels->collect = collect_columns;
     kernels->prepare_f32 = prepare_f32;
+    kernels->collect_f32 = collect_f32;
     kernels->windows_f32 = windows_f32;
     kernels->raw_f32 = raw_f32;
 }

@@ -4,6 +4,7 @@
  */
 #include <stddef.h>
 
+#include "upb_collect.h"
 #include "upb_kernels.h"
 #include "upb_network_int.h"
 
@@ -25,6 +26,12 @@ static void prepare_int_c(upb_prepared_int *prepared, const upb_model_int *model
         prepared->row[UPB_INTENSITY_TOP][k] = i[top];
         prepared->row[UPB_INTENSITY_BOTTOM][k] = i[bottom];
     }
+}
+
+static void collect_int_c(upb_prepared_int *prepared, const upb_model_int *model, const upb_beam_sources *sources,
+                          uint16_t *distance, uint8_t *intensity) {
+    collect_beams(distance, intensity, sources);
+    prepare_int_c(prepared, model, distance, intensity);
 }
 
 /* Fills the empty ones of three neighbours: x is one row of a window, `empty` tells of its columns. */
@@ -162,6 +169,7 @@ static void windows_int8_c(const upb_model_int *model, const upb_prepared_int *l
 
 void upb_kernels_fill_int_c(upb_kernels *kernels) {
     kernels->prepare_int = prepare_int_c;
+    kernels->collect_int = collect_int_c;
     kernels->windows_int16 = windows_int16_c;
     kernels->windows_int8 = windows_int8_c;
 }

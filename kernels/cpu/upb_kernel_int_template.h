@@ -29,11 +29,20 @@ UPB_INLINE limits limits_of(const upb_model_int *model) {
 }
 
 /* Shifted by k here, once for the three windows of a column. */
+UPB_INLINE void prepare_rows(upb_prepared_int *prepared, const upb_model_int *model, rows of_column) {
+    const limits of = limits_of(model);
+    const upb_network_int *const net = model->network;
+    prepare(prepared, &of, (const uint32_t[2]){net[UPB_DISTANCE].k, net[UPB_INTENSITY].k}, of_column);
+}
+
 static void prepare_int(upb_prepared_int *prepared, const upb_model_int *model, const uint16_t *distance,
                         const uint8_t *intensity) {
-    const limits of = limits_of(model);
-    prepare(prepared, &of, (const uint32_t[2]){model->network[UPB_DISTANCE].k, model->network[UPB_INTENSITY].k},
-            distance, intensity);
+    prepare_rows(prepared, model, load_rows(distance, intensity));
+}
+
+static void collect_int(upb_prepared_int *prepared, const upb_model_int *model, const upb_beam_sources *sources,
+                        uint16_t *distance, uint8_t *intensity) {
+    prepare_rows(prepared, model, collect_rows(distance, intensity, sources));
 }
 
 /* No loop over the networks: compilers leave it rolled, and then keep the inputs in memory. */
@@ -97,6 +106,7 @@ static void windows_int8(const upb_model_int *model, const upb_prepared_int *lef
 
 void UPB_FILL_KERNELS(upb_kernels *kernels) {
     kernels->prepare_int = prepare_int;
+    kernels->collect_int = collect_int;
     kernels->windows_int16 = windows_int16;
     kernels->windows_int8 = windows_int8;
 }

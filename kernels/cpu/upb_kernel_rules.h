@@ -34,25 +34,45 @@ typedef struct limits {
     M fill; /* UPB_EMPTY_FILL */
 } limits;
 
-UPB_INLINE void collect(uint16_t *distance, uint8_t *intensity, const upb_beam_source *source, uint32_t sources) {
-    for (unsigned k = 0; k < UPB_LANES; k += V_LANES) {
+/* A column. */
+typedef struct rows {
+    V distance[V_BLOCKS], intensity[V_BLOCKS];
+} rows;
+
+UPB_INLINE rows load_rows(const uint16_t *distance, const uint8_t *intensity) {
+    rows column;
+    for (unsigned b = 0; b < V_BLOCKS; b++) {
+        column.distance[b] = V_LOADU(distance + b * V_LANES);
+        column.intensity[b] = V_LOAD_U8(intensity + b * V_LANES);
+    }
+    return column;
+}
+
+/* Also written to distance and intensity. */
+UPB_INLINE rows collect_rows(uint16_t *distance, uint8_t *intensity, const upb_beam_sources *sources) {
+    rows column;
+    for (unsigned b = 0; b < V_BLOCKS; b++) {
+        const unsigned k = b * V_LANES;
         V d = V_SET(0), i = V_SET(0);
-        for (uint32_t s = 0; s < sources; s++) {
-            const M here = M_BITS(source[s].beams >> k);
-            d = V_SELECT(here, V_LOADU(source[s].distance + k), d);
-            i = V_SELECT(here, V_LOAD_U8(source[s].intensity + k), i);
+        for (uint32_t s = 0; s < sources->count; s++) {
+            const upb_beam_source *source = &sources->source[s];
+            const M here = M_BITS(source->beams >> k);
+            d = V_SELECT(here, V_LOADU(source->distance + k), d);
+            i = V_SELECT(here, V_LOAD_U8(source->intensity + k), i);
         }
         V_STOREU(distance + k, d);
         V_STORE_U8(intensity + k, i);
+        column.distance[b] = d;
+        column.intensity[b] = i;
     }
+    return column;
 }
 
 /* shift: left shift of the values of each network; it leaves 0 to be 0, and the order. */
-UPB_INLINE void prepare(upb_prepared *prepared, const limits *of, const uint32_t shift[2], const uint16_t *distance,
-                        const uint8_t *intensity) {
+UPB_INLINE void prepare(upb_prepared *prepared, const limits *of, const uint32_t shift[2], rows column) {
     V d[V_BLOCKS + 1], i[V_BLOCKS + 1];
     for (unsigned b = 0; b < V_BLOCKS; b++) {
-        const V count = V_LOADU(distance + b * V_LANES), strength = V_LOAD_U8(intensity + b * V_LANES);
+        const V count = column.distance[b], strength = column.intensity[b];
         const M seen = M_AND(M_AT_LEAST(count, of->min_count), M_AT_LEAST(of->seen_max[b], count));
         d[b] = V_KEEP(seen, shift[UPB_DISTANCE] ? V_SHIFT_LEFT(count, shift[UPB_DISTANCE]) : count);
         i[b] = V_KEEP(seen, shift[UPB_INTENSITY] ? V_SHIFT_LEFT(strength, shift[UPB_INTENSITY]) : strength);

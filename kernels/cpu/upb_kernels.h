@@ -54,12 +54,11 @@ typedef struct upb_beam_source {
     uint32_t beams;
 } upb_beam_source;
 
-/*
- * Makes one column, [UPB_BEAMS], of those beams of several; no beam is of two of them, and one of none is 0. It is
- * written in the vectors that upb_prepare_* reads: a load across several stores would have to wait for them, and they
- * for everything before them.
- */
-typedef void (*upb_collect_fn)(uint16_t *distance, uint8_t *intensity, const upb_beam_source *source, uint32_t sources);
+/* Where the beams of one column are: no beam is in two sources; one that is in none is 0. */
+typedef struct upb_beam_sources {
+    upb_beam_source source[UPB_BEAMS];
+    uint32_t count;
+} upb_beam_sources;
 
 /* What a kernel needs of a model. */
 typedef struct upb_model_f32 {
@@ -88,6 +87,14 @@ typedef upb_prepared upb_prepared_f32;
 /* distance: [UPB_BEAMS] counts, 0..65535; intensity: [UPB_BEAMS]; no alignment needed. */
 typedef void (*upb_prepare_f32_fn)(upb_prepared_f32 *prepared, const upb_model_f32 *model, const uint16_t *distance,
                                    const uint8_t *intensity);
+
+/*
+ * The same of a column whose beams are in several places; the column itself is written to distance and intensity,
+ * [UPB_BEAMS]. In one function, since a vector load across the stores of others would have to wait for them, and they
+ * for everything before them.
+ */
+typedef void (*upb_collect_f32_fn)(upb_prepared_f32 *prepared, const upb_model_f32 *model,
+                                   const upb_beam_sources *sources, uint16_t *distance, uint8_t *intensity);
 
 /*
  * Both networks on the 31 windows around `middle`. Writes UPB_LANES values to both outputs (no alignment needed):
@@ -149,6 +156,9 @@ typedef upb_prepared upb_prepared_int;
 typedef void (*upb_prepare_int_fn)(upb_prepared_int *prepared, const upb_model_int *model, const uint16_t *distance,
                                    const uint8_t *intensity);
 
+typedef void (*upb_collect_int_fn)(upb_prepared_int *prepared, const upb_model_int *model,
+                                   const upb_beam_sources *sources, uint16_t *distance, uint8_t *intensity);
+
 /* As upb_windows_f32_fn, to the bit of the contract. One function for each contract. */
 typedef void (*upb_windows_int_fn)(const upb_model_int *model, const upb_prepared_int *left,
                                    const upb_prepared_int *middle, const upb_prepared_int *right, uint16_t *distance,
@@ -161,7 +171,8 @@ typedef struct upb_kernels {
     upb_prepare_int_fn prepare_int;
     upb_windows_int_fn windows_int16;
     upb_windows_int_fn windows_int8;
-    upb_collect_fn collect;
+    upb_collect_f32_fn collect_f32;
+    upb_collect_int_fn collect_int;
 } upb_kernels;
 
 /*
@@ -172,7 +183,7 @@ upb_cpu upb_kernels_select(upb_kernels *kernels, upb_cpu cpu);
 
 /*
  * Each in its own file, compiled with the flags of its instruction set: call only where the machine has it. They fill
- * in the float kernels and `collect`, or with _int_ the integer ones.
+ * in the float kernels, or with _int_ the integer ones.
  */
 void upb_kernels_fill_c(upb_kernels *kernels);
 void upb_kernels_fill_c_fma(upb_kernels *kernels);

@@ -50,10 +50,11 @@ enum { PREPARED_COLUMNS = 4, EMPTY_COLUMN = 3 };
 struct upb_stream {
     _Alignas(UPB_ALIGN) uint16_t out_distance[UPB_ROWS];
     uint8_t out_intensity[UPB_ROWS];
-    upb_collect_fn collect;
     upb_prepare_f32_fn prepare_f32;
+    upb_collect_f32_fn collect_f32;
     upb_windows_f32_fn windows_f32;
     upb_prepare_int_fn prepare_int;
+    upb_collect_int_fn collect_int;
     upb_windows_int_fn windows_int; /* of the precision */
     const upb_model *model;
     const upb_model_int *integer; /* of the precision; null: float */
@@ -239,10 +240,11 @@ static column_ring place_ring(uint32_t slots, unsigned char *memory) {
 static void choose_kernels(upb_stream *s, const upb_stream_config *config) {
     upb_kernels kernels;
     s->stats.cpu = upb_kernels_select(&kernels, (upb_cpu)config->cpu);
-    s->collect = kernels.collect;
     s->prepare_f32 = kernels.prepare_f32;
+    s->collect_f32 = kernels.collect_f32;
     s->windows_f32 = kernels.windows_f32;
     s->prepare_int = kernels.prepare_int;
+    s->collect_int = kernels.collect_int;
     s->windows_int = config->precision == UPB_PRECISION_INT16 ? kernels.windows_int16 : kernels.windows_int8;
     s->integer = config->precision == UPB_PRECISION_FP32 ? NULL : upb_model_integer(s->model, config->precision);
 }
@@ -308,6 +310,15 @@ static void prepare(const upb_stream *s, upb_prepared *prepared, const uint16_t 
         s->prepare_f32(prepared, &s->model->f32, distance, intensity);
 }
 
+/* The same of a column that is collected to distance and intensity. */
+static void prepare_collected(const upb_stream *s, upb_prepared *prepared, const upb_beam_sources *sources,
+                              uint16_t *distance, uint8_t *intensity) {
+    if (s->integer)
+        s->collect_int(prepared, s->integer, sources, distance, intensity);
+    else
+        s->collect_f32(prepared, &s->model->f32, sources, distance, intensity);
+}
+
 static void make_windows(const upb_stream *s, const upb_prepared *right, uint16_t *distance, uint8_t *intensity) {
     if (s->integer)
         s->windows_int(s->integer, s->left, s->middle, right, distance, intensity);
@@ -347,11 +358,10 @@ static void keep_pending(upb_stream *s, const upb_prepared *prepared, const uint
         (complete ? 0 : UPB_COLUMN_INCOMPLETE) | (s->next.column + 1 == s->columns ? UPB_COLUMN_LAST : 0);
 }
 
-/* Takes the next azimuth column of the segment. */
+/* Takes the next azimuth column of the segment, which was prepared in the spare place. */
 static void take_azimuth_column(upb_stream *s, const uint16_t *distance, const uint8_t *intensity, int complete) {
     upb_prepared *prepared = &s->prepared[s->spare];
     s->spare = s->spare + 1 == EMPTY_COLUMN ? 0 : s->spare + 1;
-    prepare(s, prepared, distance, intensity);
     if (s->pending) {
         finish(s, prepared);
         s->left = s->middle;
@@ -371,9 +381,11 @@ static void take_azimuth_column(upb_stream *s, const uint16_t *distance, const u
 /* --------------------------------------------------------------------------------------- firing columns */
 
 /* Where the beams of the azimuth column are that the firing column given completes; returns those that arrived. */
-static uint32_t find_beams(const upb_stream *s, upb_beam_source *source, const uint16_t *distance,
+static uint32_t find_beams(const upb_stream *s, upb_beam_sources *sources, const uint16_t *distance,
                            const uint8_t *intensity) {
     uint32_t arrived = 0;
+    upb_beam_source *source = sources->source;
+    sources->count = s->beams.groups;
     for (uint32_t g = 0; g < s->beams.groups; g++) {
         const uint32_t age = s->beams.group_age[g];
         const uint32_t at = s->newest >= age ? s->newest - age : s->newest + s->beams.slots - age;
@@ -394,10 +406,10 @@ static void take_ring_column(upb_stream *s, const uint16_t *distance, const uint
     else {
         _Alignas(UPB_ALIGN) uint16_t collected_distance[UPB_BEAMS];
         _Alignas(UPB_ALIGN) uint8_t collected_intensity[UPB_BEAMS];
-        upb_beam_source source[UPB_BEAMS];
+        upb_beam_sources sources;
         const uint32_t arrived =
-            find_beams(s, source, distance ? distance : no_distance, distance ? intensity : no_intensity);
-        s->collect(collected_distance, collected_intensity, source, s->beams.groups);
+            find_beams(s, &sources, distance ? distance : no_distance, distance ? intensity : no_intensity);
+        prepare_collected(s, &s->prepared[s->spare], &sources, collected_distance, collected_intensity);
         take_azimuth_column(s, collected_distance, collected_intensity, arrived == ALL_BEAMS);
     }
     if (distance) {
@@ -417,6 +429,7 @@ static void take_firing_column(upb_stream *s, const uint16_t *distance, const ui
     if (s->ring.received) {
         take_ring_column(s, distance, intensity);
     } else {
+        prepare(s, &s->prepared[s->spare], distance ? distance : no_distance, distance ? intensity : no_intensity);
         take_azimuth_column(s, distance ? distance : no_distance, distance ? intensity : no_intensity,
                             distance != NULL);
     }

@@ -265,35 +265,49 @@ static void check_by_hand(const upb_kernels *kernels) {
 
 /* ------------------------------------------------------------------------------------------- collecting */
 
-static void compare_collected(const upb_kernels *kernels, const raw_column *from, const uint8_t owner[UPB_BEAMS],
-                              const upb_beam_source *source, uint32_t sources) {
-    raw_column got;
-    memset(&got, 0xee, sizeof got);
-    kernels->collect(got.distance, got.intensity, source, sources);
-    for (unsigned k = 0; k < UPB_BEAMS; k++) {
-        const int is_some = owner[k] < sources;
-        CHECK_EQUAL(got.distance[k], is_some ? from[owner[k]].distance[k] : 0);
-        CHECK_EQUAL(got.intensity[k], is_some ? from[owner[k]].intensity[k] : 0);
-    }
+/* What collecting gives, and preparing what is collected. */
+typedef struct collected {
+    upb_prepared prepared;
+    raw_column column;
+} collected;
+
+static void compare_collected(const collected *got, const raw_column *column, const upb_prepared *expected) {
+    CHECK(!memcmp(got->column.distance, column->distance, sizeof column->distance));
+    CHECK(!memcmp(got->column.intensity, column->intensity, sizeof column->intensity));
+    CHECK(!memcmp(got->prepared.row, expected->row, sizeof expected->row));
 }
 
-/* Beams of a few columns or many, and some of none. */
+/* Beams of a few columns or many, and some of none; random models, whose limits cut some. */
 static void check_collect(const upb_kernels *kernels, random_source *random) {
-    raw_column from[UPB_BEAMS];
+    static upb_model_f32 f32;
+    static int_model integer;
+    random_model_f32(random, &f32, 1, 0);
+    random_int_model(random, &integer, UPB_PRECISION_INT8, 1, 0);
+    raw_column from[UPB_BEAMS], column;
     for (unsigned i = 0; i < UPB_BEAMS; i++)
         pattern_column(random, i % PATTERNS, 1, 65535, &from[i]);
     for (unsigned round = 0; round < 200; round++) {
-        const uint32_t sources = random_below(random, UPB_BEAMS + 1), owners = sources + random_below(random, 3);
-        upb_beam_source source[UPB_BEAMS];
-        uint8_t owner[UPB_BEAMS];
-        for (uint32_t i = 0; i < sources; i++)
-            source[i] = (upb_beam_source){from[i].distance, from[i].intensity, 0};
+        upb_beam_sources sources = {.count = random_below(random, UPB_BEAMS + 1)};
+        const uint32_t owners = sources.count + 1 + random_below(random, 3);
+        memset(&column, 0, sizeof column);
+        for (uint32_t i = 0; i < sources.count; i++)
+            sources.source[i] = (upb_beam_source){from[i].distance, from[i].intensity, 0};
         for (unsigned k = 0; k < UPB_BEAMS; k++) {
-            owner[k] = (uint8_t)(owners ? random_below(random, owners) : 0);
-            if (owner[k] < sources)
-                source[owner[k]].beams |= 1u << k;
+            const uint32_t owner = random_below(random, owners);
+            if (owner >= sources.count)
+                continue;
+            sources.source[owner].beams |= 1u << k;
+            column.distance[k] = from[owner].distance[k];
+            column.intensity[k] = from[owner].intensity[k];
         }
-        compare_collected(kernels, from, owner, source, sources);
+        upb_prepared expected;
+        collected got;
+        kernels->prepare_f32(&expected, &f32, column.distance, column.intensity);
+        kernels->collect_f32(&got.prepared, &f32, &sources, got.column.distance, got.column.intensity);
+        compare_collected(&got, &column, &expected);
+        kernels->prepare_int(&expected, &integer.ready, column.distance, column.intensity);
+        kernels->collect_int(&got.prepared, &integer.ready, &sources, got.column.distance, got.column.intensity);
+        compare_collected(&got, &column, &expected);
     }
 }
 
@@ -480,7 +494,8 @@ static const upb_model *load(const char *path) {
     return model;
 }
 
-/* Known answers, collected columns and, if asked for, times of every instruction set. `required`: the name of one that must be there. */
+/* Known answers, collected columns and, if asked for, times of every instruction set. `required`: the name of one that
+ * must be there. */
 static void visit_cpus(const upb_model *model, int is_bench, const char *required, random_source random) {
     static bench_models models;
     choose_models(&models, model, &random);
