@@ -1,0 +1,179 @@
+/*
+ * The device on its buses: status out on CAN and serial, commands in, diagnostics. One object, in the caller's memory,
+ * driven by the caller: frames and bytes in, snapshot in, time in; frames and bytes out through function pointers.
+ *
+ * Usage (one thread; all times are ns of one monotonic clock):
+ *     static upb_bus bus;
+ *     upb_bus_config config = upb_bus_config_default();
+ *     config.can.send = ...; config.serial.send = ...; config.storage = ...; config.key = ...; config.execute = ...;
+ *     upb_bus_init(&bus, &config, now);
+ *     for (;;) {
+ *         upb_bus_can(&bus, &frame, now);                  // each frame received
+ *         upb_bus_serial(&bus, bytes, count, now);         // bytes received
+ *         upb_bus_ledger(&bus, &record, now);              // each frame of the ledger that closed
+ *         upb_faults_report(&bus.faults, id, look, now);   // each look of a monitor
+ *         upb_bus_step(&bus, &snapshot, now);              // every 10 ms or more often
+ *     }
+ *     upb_bus_end(&bus);
+ *
+ * Messages, identifiers, cycle times: hw_sim/can/upbeam.dbc and docs/can.md.
+ */
+#ifndef UPBEAM_BUS_H
+#define UPBEAM_BUS_H
+
+#include "upbeam/can.h"
+#include "upbeam/command.h"
+#include "upbeam/console.h"
+#include "upbeam/e2e.h"
+#include "upbeam/faults.h"
+#include "upbeam/uds.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef enum upb_bus_state {
+    UPB_STATE_STARTING = 0,
+    UPB_STATE_RUNNING = 1,
+    UPB_STATE_DEGRADED = 2,  /* running, not in mode NETWORK */
+    UPB_STATE_NO_SENSOR = 3, /* no packets come */
+    UPB_STATE_FAULT = 4,     /* no output */
+    UPB_STATE_STOPPING = 5
+} upb_bus_state;
+
+/* Counters on CAN (UPB_Counters, multiplexed) and in UDS; since power-on. */
+typedef enum upb_counter {
+    UPB_COUNTER_PACKETS_IN = 0,
+    UPB_COUNTER_PACKETS_OUT = 1,
+    UPB_COUNTER_PACKETS_DROPPED = 2, /* all causes */
+    UPB_COUNTER_COLUMNS_IN = 3,
+    UPB_COUNTER_COLUMNS_OUT = 4,
+    UPB_COUNTER_COLUMNS_MISSING = 5,
+    UPB_COUNTER_FRAMES = 6, /* closed in the ledger */
+    UPB_COUNTER_FRAMES_MISSED = 7,
+    UPB_COUNTER_FRAMES_PARTIAL = 8,
+    UPB_COUNTER_FRAMES_LOST = 9,
+    UPB_COUNTER_MODE_CHANGES = 10,
+    /* the bus fills in what follows */
+    UPB_COUNTER_COMMANDS_TAKEN = 11,
+    UPB_COUNTER_COMMANDS_REFUSED = 12,
+    UPB_COUNTER_CAN_FAILED = 13,     /* CAN frames that could not be sent */
+    UPB_COUNTER_SERIAL_FAILED = 14,  /* records that could not be sent */
+    UPB_COUNTER_SERIAL_REFUSED = 15, /* records that were not understood */
+    UPB_COUNTER_LEDGER_DROPPED = 16  /* ledger records that could not be sent on CAN */
+} upb_counter;
+
+#define UPB_COUNTERS 17u
+#define UPB_DROP_CAUSES_MAX 16u
+
+/* What the device is doing. All but the bus's own counters comes from the caller. */
+typedef struct upb_bus_snapshot {
+    upb_ledger_record record;            /* of the last frame that closed */
+    uint32_t state;                      /* upb_bus_state */
+    uint32_t mode;                       /* upb_mode now */
+    uint64_t latency_max_ns;             /* greatest of all frames judged */
+    uint64_t counters[UPB_COUNTERS];     /* by upb_counter */
+    uint64_t drops[UPB_DROP_CAUSES_MAX]; /* packets dropped, by the daemon's cause */
+    uint32_t model_crc32;                /* upb_model_info.crc32, 0: no model */
+    uint32_t model_swaps;
+    uint32_t precision; /* upb_precision */
+    uint32_t cpu;       /* upb_cpu */
+} upb_bus_snapshot;
+
+typedef enum upb_message {
+    UPB_MESSAGE_STATUS = 0,       /* 0x210, 50 ms */
+    UPB_MESSAGE_LATENCY = 1,      /* 0x211, 50 ms */
+    UPB_MESSAGE_COUNTERS = 2,     /* 0x212, 100 ms, one counter each time */
+    UPB_MESSAGE_FAULTS = 3,       /* 0x213, 100 ms */
+    UPB_MESSAGE_FAULT_DETAIL = 4, /* 0x214, 100 ms, one fault each time; not sent while nothing is remembered */
+    UPB_MESSAGE_MODEL = 5,        /* 0x215, 1000 ms */
+    UPB_MESSAGE_LEDGER = 6        /* 0x220, CAN FD, each frame */
+} upb_message;
+
+#define UPB_MESSAGES 7u
+
+#define UPB_UDS_REQUEST_ID 0x7a0u
+#define UPB_UDS_RESPONSE_ID 0x7a8u
+#define UPB_UDS_FUNCTIONAL_ID 0x7dfu
+
+/* Identifier, cycle time (0: on event) and E2E configuration of a message, as the DBC has them. Null: no such one. */
+typedef struct upb_message_info {
+    const char *name;
+    uint32_t id;
+    uint32_t flags; /* UPB_CAN_* */
+    uint32_t cycle_ms;
+    upb_e2e_config e2e; /* Profile 11; Profile 5 for FD messages */
+} upb_message_info;
+
+UPB_API const upb_message_info *upb_message_get_info(upb_message message);
+
+#define UPB_LEDGER_QUEUE 8u
+
+/* Status messages on one channel, with their own E2E counters. */
+typedef struct upb_sender {
+    uint64_t due_ns[UPB_MESSAGES];
+    uint64_t failed; /* frames dropped */
+    uint64_t sent;
+    uint8_t sequence[UPB_MESSAGES];
+    uint8_t counter_index; /* next of UPB_Counters */
+    uint8_t fault_index;   /* next of UPB_FaultDetail */
+    uint8_t queue_first, queue_count;
+    uint64_t ledger_dropped; /* records pushed out of the queue */
+    upb_ledger_record queue[UPB_LEDGER_QUEUE];
+} upb_sender;
+
+typedef struct upb_bus_config {
+    uint32_t struct_bytes;     /* sizeof(upb_bus_config), set by upb_bus_config_default */
+    uint32_t status_on_serial; /* 1: the status messages also go to the serial line (default) */
+    upb_can_transport can;
+    upb_serial_transport serial;
+    upb_storage storage; /* both functions, or neither: commands are then refused (STORAGE) and faults not kept */
+    const uint8_t *key;  /* UPB_KEY_BYTES, copied; null: no command is taken */
+    upb_command_fn execute;
+    int (*reset)(void *user, uint32_t type); /* upb_uds_config.reset; null: ECUReset is refused */
+    void *user;                              /* of execute and reset */
+    uint32_t clear_locked;                   /* upb_uds_config.clear_locked */
+    upb_isotp_config isotp;                  /* identifiers and timeouts of diagnostics */
+} upb_bus_config;
+
+UPB_API upb_bus_config upb_bus_config_default(void);
+
+typedef struct upb_bus {
+    upb_bus_config config;
+    upb_faults faults;
+    upb_commands commands;
+    upb_isotp isotp;
+    upb_uds uds;
+    upb_sender can;
+    upb_sender serial;
+    upb_console_parser parser;
+    upb_bus_snapshot snapshot; /* of the last step */
+    uint64_t save_ns;          /* earliest next write of the fault memory */
+    uint8_t can_failing;
+    uint8_t response_pending; /* a response that the transport had no room for: 1 CAN, 2 serial */
+    upb_can_frame response;
+} upb_bus;
+
+/* Reads storage, begins an operation cycle. Errors: ARGUMENT. */
+UPB_API upb_status upb_bus_init(upb_bus *bus, const upb_bus_config *config, uint64_t now_ns);
+/* A CAN frame received: command or diagnostics; true if it was for this device. */
+UPB_API int upb_bus_can(upb_bus *bus, const upb_can_frame *frame, uint64_t now_ns);
+/* Bytes received on the serial line: commands. */
+UPB_API void upb_bus_serial(upb_bus *bus, const uint8_t *bytes, size_t count, uint64_t now_ns);
+/* Queues a record that closed for both channels; it leaves at the next step. */
+UPB_API void upb_bus_ledger(upb_bus *bus, const upb_ledger_record *record);
+/*
+ * Sends what is due: status messages, ledger records, diagnostics. Keeps faults CAN_BUS_OFF (the transport fails),
+ * CAN_COMMAND_REJECTED and SERIAL_FRAMING; writes the fault memory at most once a second.
+ */
+UPB_API void upb_bus_step(upb_bus *bus, const upb_bus_snapshot *snapshot, uint64_t now_ns);
+/* When upb_bus_step has something to do next, if nothing arrives before. */
+UPB_API uint64_t upb_bus_next_ns(const upb_bus *bus, uint64_t now_ns);
+/* Writes the fault memory. */
+UPB_API upb_stored upb_bus_end(upb_bus *bus);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif /* UPBEAM_BUS_H */
