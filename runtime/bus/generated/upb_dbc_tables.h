@@ -1,0 +1,86 @@
+/* Written by upbeam.runtime.bus.generate from hw_sim/can/upbeam.dbc: change that. */
+
+/* Messages the device sends of its own accord, in the order of their identifiers (upb_message). */
+static const upb_message_info dbc_messages[] = {
+    {"UPB_Status", 0x210u, 0u, 50u, {0x210u, 8u, 2u}},
+    {"UPB_Latency", 0x211u, 0u, 50u, {0x211u, 8u, 2u}},
+    {"UPB_Counters", 0x212u, 0u, 100u, {0x212u, 8u, 2u}},
+    {"UPB_Faults", 0x213u, 0u, 100u, {0x213u, 8u, 2u}},
+    {"UPB_FaultDetail", 0x214u, 0u, 100u, {0x214u, 8u, 2u}},
+    {"UPB_Model", 0x215u, 0u, 1000u, {0x215u, 8u, 2u}},
+    {"UPB_Ledger", 0x220u, UPB_CAN_FD | UPB_CAN_BRS, 0u, {0x220u, 64u, 2u}},
+};
+
+/* Counters: multiplexer value, and the place of the value in struct upb_dbc_upb_counters_t. */
+static const struct {
+    uint8_t index;
+    size_t offset;
+} dbc_counters[] = {
+    {0u, offsetof(struct upb_dbc_upb_counters_t, packets_in)},
+    {1u, offsetof(struct upb_dbc_upb_counters_t, packets_out)},
+    {2u, offsetof(struct upb_dbc_upb_counters_t, packets_dropped)},
+    {3u, offsetof(struct upb_dbc_upb_counters_t, columns_in)},
+    {4u, offsetof(struct upb_dbc_upb_counters_t, columns_out)},
+    {5u, offsetof(struct upb_dbc_upb_counters_t, columns_missing)},
+    {6u, offsetof(struct upb_dbc_upb_counters_t, frames)},
+    {7u, offsetof(struct upb_dbc_upb_counters_t, frames_missed)},
+    {8u, offsetof(struct upb_dbc_upb_counters_t, frames_partial)},
+    {9u, offsetof(struct upb_dbc_upb_counters_t, frames_lost)},
+    {10u, offsetof(struct upb_dbc_upb_counters_t, mode_changes)},
+    {11u, offsetof(struct upb_dbc_upb_counters_t, commands_taken)},
+    {12u, offsetof(struct upb_dbc_upb_counters_t, commands_refused)},
+    {13u, offsetof(struct upb_dbc_upb_counters_t, can_failed)},
+    {14u, offsetof(struct upb_dbc_upb_counters_t, serial_failed)},
+    {15u, offsetof(struct upb_dbc_upb_counters_t, serial_refused)},
+    {16u, offsetof(struct upb_dbc_upb_counters_t, ledger_dropped)},
+    {32u, offsetof(struct upb_dbc_upb_counters_t, drop_cause00)},
+    {33u, offsetof(struct upb_dbc_upb_counters_t, drop_cause01)},
+    {34u, offsetof(struct upb_dbc_upb_counters_t, drop_cause02)},
+    {35u, offsetof(struct upb_dbc_upb_counters_t, drop_cause03)},
+    {36u, offsetof(struct upb_dbc_upb_counters_t, drop_cause04)},
+    {37u, offsetof(struct upb_dbc_upb_counters_t, drop_cause05)},
+    {38u, offsetof(struct upb_dbc_upb_counters_t, drop_cause06)},
+    {39u, offsetof(struct upb_dbc_upb_counters_t, drop_cause07)},
+    {40u, offsetof(struct upb_dbc_upb_counters_t, drop_cause08)},
+    {41u, offsetof(struct upb_dbc_upb_counters_t, drop_cause09)},
+    {42u, offsetof(struct upb_dbc_upb_counters_t, drop_cause10)},
+    {43u, offsetof(struct upb_dbc_upb_counters_t, drop_cause11)},
+    {44u, offsetof(struct upb_dbc_upb_counters_t, drop_cause12)},
+    {45u, offsetof(struct upb_dbc_upb_counters_t, drop_cause13)},
+    {46u, offsetof(struct upb_dbc_upb_counters_t, drop_cause14)},
+    {47u, offsetof(struct upb_dbc_upb_counters_t, drop_cause15)},
+};
+
+/* Faults by id: the place of the bit in struct upb_dbc_upb_faults_t. */
+static const size_t dbc_fault_bits[] = {
+    [0] = 0,
+    [1] = offsetof(struct upb_dbc_upb_faults_t, sensor_timeout),
+    [2] = offsetof(struct upb_dbc_upb_faults_t, sensor_azimuth_stuck),
+    [3] = offsetof(struct upb_dbc_upb_faults_t, sensor_azimuth_jump),
+    [4] = offsetof(struct upb_dbc_upb_faults_t, sensor_time_jump),
+    [5] = offsetof(struct upb_dbc_upb_faults_t, sensor_rpm_range),
+    [6] = offsetof(struct upb_dbc_upb_faults_t, sensor_beam_dead),
+    [7] = offsetof(struct upb_dbc_upb_faults_t, sensor_ring_stuck),
+    [8] = offsetof(struct upb_dbc_upb_faults_t, sensor_all_zero),
+    [9] = offsetof(struct upb_dbc_upb_faults_t, sensor_thermal),
+    [10] = offsetof(struct upb_dbc_upb_faults_t, sensor_pps_lost),
+    [11] = offsetof(struct upb_dbc_upb_faults_t, sensor_visibility),
+    [12] = offsetof(struct upb_dbc_upb_faults_t, sensor_crosstalk),
+    [13] = offsetof(struct upb_dbc_upb_faults_t, sensor_wrong_model),
+    [14] = offsetof(struct upb_dbc_upb_faults_t, net_loss),
+    [15] = offsetof(struct upb_dbc_upb_faults_t, net_reorder),
+    [16] = offsetof(struct upb_dbc_upb_faults_t, net_duplicate),
+    [17] = offsetof(struct upb_dbc_upb_faults_t, net_malformed),
+    [18] = offsetof(struct upb_dbc_upb_faults_t, net_flood),
+    [19] = offsetof(struct upb_dbc_upb_faults_t, net_jitter),
+    [20] = offsetof(struct upb_dbc_upb_faults_t, compute_overload),
+    [21] = offsetof(struct upb_dbc_upb_faults_t, compute_deadline),
+    [22] = offsetof(struct upb_dbc_upb_faults_t, compute_integrity),
+    [23] = offsetof(struct upb_dbc_upb_faults_t, compute_throttle),
+    [24] = offsetof(struct upb_dbc_upb_faults_t, clock_drift),
+    [25] = offsetof(struct upb_dbc_upb_faults_t, can_bus_off),
+    [26] = offsetof(struct upb_dbc_upb_faults_t, can_command_rejected),
+    [27] = offsetof(struct upb_dbc_upb_faults_t, serial_framing),
+    [28] = offsetof(struct upb_dbc_upb_faults_t, model_rejected),
+    [29] = offsetof(struct upb_dbc_upb_faults_t, power_reset),
+};
