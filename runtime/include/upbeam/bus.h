@@ -81,13 +81,13 @@ typedef struct upb_bus_snapshot {
 } upb_bus_snapshot;
 
 typedef enum upb_message {
-    UPB_MESSAGE_STATUS = 0,       /* 0x210, 50 ms */
-    UPB_MESSAGE_LATENCY = 1,      /* 0x211, 50 ms */
-    UPB_MESSAGE_COUNTERS = 2,     /* 0x212, 100 ms, one counter each time */
-    UPB_MESSAGE_FAULTS = 3,       /* 0x213, 100 ms */
-    UPB_MESSAGE_FAULT_DETAIL = 4, /* 0x214, 100 ms, one fault each time; not sent while nothing is remembered */
-    UPB_MESSAGE_MODEL = 5,        /* 0x215, 1000 ms */
-    UPB_MESSAGE_LEDGER = 6        /* 0x220, CAN FD, each frame */
+    UPB_MESSAGE_STATUS = 0,
+    UPB_MESSAGE_LATENCY = 1,
+    UPB_MESSAGE_COUNTERS = 2, /* one counter each time */
+    UPB_MESSAGE_FAULTS = 3,
+    UPB_MESSAGE_FAULT_DETAIL = 4, /* one fault each time; not sent while none is remembered */
+    UPB_MESSAGE_MODEL = 5,
+    UPB_MESSAGE_LEDGER = 6 /* CAN FD, each frame that closed */
 } upb_message;
 
 #define UPB_MESSAGES 7u
@@ -96,24 +96,26 @@ typedef enum upb_message {
 #define UPB_UDS_RESPONSE_ID 0x7a8u
 #define UPB_UDS_FUNCTIONAL_ID 0x7dfu
 
-/* Identifier, cycle time (0: on event) and E2E configuration of a message, as the DBC has them. Null: no such one. */
+/* A message as the DBC has it. */
 typedef struct upb_message_info {
     const char *name;
     uint32_t id;
-    uint32_t flags; /* UPB_CAN_* */
-    uint32_t cycle_ms;
+    uint32_t flags;     /* UPB_CAN_* */
+    uint32_t cycle_ms;  /* 0: on event */
     upb_e2e_config e2e; /* Profile 11; Profile 5 for FD messages */
 } upb_message_info;
 
+/* Null: no such message. */
 UPB_API const upb_message_info *upb_message_get_info(upb_message message);
 
 #define UPB_LEDGER_QUEUE 8u
+#define UPB_BUS_HEAL_NS 5000000000u /* a refused command or record stays a fault this long, if no other follows */
 
 /* Status messages on one channel, with their own E2E counters. */
 typedef struct upb_sender {
     uint64_t due_ns[UPB_MESSAGES];
-    uint64_t failed; /* frames dropped */
     uint64_t sent;
+    uint64_t failed; /* frames dropped */
     uint8_t sequence[UPB_MESSAGES];
     uint8_t counter_index; /* next of UPB_Counters */
     uint8_t fault_index;   /* next of UPB_FaultDetail */
@@ -147,10 +149,15 @@ typedef struct upb_bus {
     upb_sender can;
     upb_sender serial;
     upb_console_parser parser;
-    upb_bus_snapshot snapshot; /* of the last step */
-    uint64_t save_ns;          /* earliest next write of the fault memory */
-    uint8_t can_failing;
-    uint8_t response_pending; /* a response that the transport had no room for: 1 CAN, 2 serial */
+    upb_bus_snapshot snapshot;   /* of the last step */
+    uint64_t command_refused_ns; /* when the last command, and serial record, was refused; UINT64_MAX: long ago */
+    uint64_t record_refused_ns;
+    uint64_t records_unknown; /* good records that are no command */
+    uint64_t now_ns;          /* of the last call */
+    uint64_t save_ns;         /* earliest next write of the fault memory */
+    uint64_t can_failed;      /* frames the transport dropped, all senders */
+    uint64_t serial_failed;
+    uint8_t response_pending; /* the transport had no room for the response: 1 CAN, 2 serial */
     upb_can_frame response;
 } upb_bus;
 
@@ -163,13 +170,12 @@ UPB_API void upb_bus_serial(upb_bus *bus, const uint8_t *bytes, size_t count, ui
 /* Queues a record that closed for both channels; it leaves at the next step. */
 UPB_API void upb_bus_ledger(upb_bus *bus, const upb_ledger_record *record);
 /*
- * Sends what is due: status messages, ledger records, diagnostics. Keeps faults CAN_BUS_OFF (the transport fails),
- * CAN_COMMAND_REJECTED and SERIAL_FRAMING; writes the fault memory at most once a second.
+ * Sends what is due: status messages, ledger records, diagnostics. Keeps the faults that are the bus's own: CAN_BUS_OFF
+ * (the transport fails), CAN_COMMAND_REJECTED and SERIAL_FRAMING (healed UPB_BUS_HEAL_NS after the last refusal),
+ * POWER_RESET (healed when the state is RUNNING). Writes the fault memory at most once a second.
  */
 UPB_API void upb_bus_step(upb_bus *bus, const upb_bus_snapshot *snapshot, uint64_t now_ns);
-/* When upb_bus_step has something to do next, if nothing arrives before. */
-UPB_API uint64_t upb_bus_next_ns(const upb_bus *bus, uint64_t now_ns);
-/* Writes the fault memory. */
+/* The end in good order (upb_faults_end). */
 UPB_API upb_stored upb_bus_end(upb_bus *bus);
 
 #ifdef __cplusplus

@@ -47,7 +47,7 @@ UPB_API upb_status upb_can_frame_decode(const uint8_t *bytes, size_t count, upb_
 
 typedef enum upb_send {
     UPB_SEND_DONE = 0,
-    UPB_SEND_BUSY = 1,  /* no room now: the same frame is offered again at the next step */
+    UPB_SEND_BUSY = 1,  /* no room now: offered again at the next step, with what is true then */
     UPB_SEND_FAILED = 2 /* the bus is off, the link is gone: the frame is dropped and counted */
 } upb_send;
 

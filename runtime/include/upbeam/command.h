@@ -78,7 +78,7 @@ typedef upb_command_result (*upb_command_fn)(void *user, const upb_command *comm
 typedef struct upb_commands {
     uint8_t key[UPB_KEY_BYTES];
     uint8_t has_key;
-    uint8_t storage_good; /* the freshness counter is known, and the last write succeeded */
+    uint8_t storage_good; /* the freshness counter is known */
     uint8_t sequence;     /* E2E counter of the next response */
     uint32_t freshness;   /* of the last command taken, 0: none ever */
     upb_storage storage;

@@ -87,8 +87,9 @@ typedef struct upb_fault_entry {
     int8_t counter;       /* fault detection counter: 127 failed, -128 passed */
     uint8_t cycles_ok;    /* operation cycles since the last failure, for ageing */
     uint8_t mode;         /* upb_mode at the last failure */
+    uint16_t cycle;       /* operation cycle of the last failure, modulo 65536 */
     uint16_t occurrences; /* times it became failed, up to 65535 */
-    uint64_t first_ns;    /* when it first and last became failed: time of the caller's clock, since power-on */
+    uint64_t first_ns;    /* when it first and last became failed: the caller's clock, in the cycle it was then */
     uint64_t last_ns;
     uint64_t frame; /* frame at the last failure */
 } upb_fault_entry;
@@ -98,6 +99,8 @@ typedef struct upb_faults {
     upb_debounce debounce[UPB_FAULTS + 1u];
     upb_storage storage;
     uint32_t latest;         /* id that failed last, 0: none */
+    uint32_t cycle;          /* operation cycles begun, this one with them */
+    uint32_t ended;          /* upb_faults_end was called */
     uint32_t dirty;          /* differs from what is stored */
     uint32_t store_failures; /* writes refused, and a stored memory that could not be read */
     uint64_t frame;          /* upb_faults_context */
@@ -107,10 +110,11 @@ typedef struct upb_faults {
 #define UPB_FAULTS_AGE_CYCLES 40u /* operation cycles without the fault after which it is no longer confirmed */
 
 /*
- * Reads what is stored (a null read function: nothing) and begins an operation cycle. Damaged storage starts empty and
- * counts a store failure. Errors: ARGUMENT.
+ * Reads what is stored (a null read function: nothing) and begins an operation cycle: no test has failed yet, pending
+ * and confirmed faults are remembered. Damaged storage starts empty and counts a store failure. If the cycle before was
+ * not ended by upb_faults_end, POWER_RESET fails at `now_ns`. Errors: ARGUMENT.
  */
-UPB_API upb_status upb_faults_init(upb_faults *faults, const upb_storage *storage);
+UPB_API upb_status upb_faults_init(upb_faults *faults, const upb_storage *storage, uint64_t now_ns);
 /* What the next failures are remembered with. */
 UPB_API void upb_faults_context(upb_faults *faults, uint64_t frame, uint32_t mode);
 /* A monitor's look. True if testFailed changed. Unknown ids are ignored. */
@@ -127,8 +131,11 @@ UPB_API upb_status upb_faults_clear(upb_faults *faults, uint32_t id);
  * once a second, upb_bus_end always. Without a write function: UPB_STORED_DONE, nothing is kept.
  */
 UPB_API upb_stored upb_faults_save(upb_faults *faults);
+/* Ends the operation cycle in good order and writes the memory: the next start finds no POWER_RESET. */
+UPB_API upb_stored upb_faults_end(upb_faults *faults);
 
-#define UPB_STORE_FAULTS_BYTES (8u + 32u * UPB_FAULTS_MAX)
+/* What is stored of the fault memory: always this many bytes (upb_faults.c has their order). */
+#define UPB_STORE_FAULTS_BYTES (12u + 32u * UPB_FAULTS_MAX)
 
 #ifdef __cplusplus
 }

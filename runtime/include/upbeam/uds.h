@@ -66,6 +66,8 @@ UPB_API const uint8_t *upb_isotp_message(const upb_isotp *link, size_t *count, i
 UPB_API void upb_isotp_take(upb_isotp *link);
 /* Begins to send. Errors: ARGUMENT (empty, too long), ORDER (one is still being sent). */
 UPB_API upb_status upb_isotp_send(upb_isotp *link, const uint8_t *bytes, size_t count, uint64_t now_ns);
+/* True until the last frame of the message has left, or the message was given up. */
+UPB_API int upb_isotp_is_sending(const upb_isotp *link);
 /* Sends what is due, ends what is late. At most 16 frames a call. */
 UPB_API void upb_isotp_step(upb_isotp *link, uint64_t now_ns);
 
@@ -88,8 +90,9 @@ typedef struct upb_uds_config {
     size_t (*read_did)(void *user, uint32_t did, uint8_t *bytes, size_t room);
     /* ECUReset: true if the device will reset after the answer. Null: service not supported. */
     int (*reset)(void *user, uint32_t type);
-    void *user;
     uint32_t clear_locked; /* 1: ClearDiagnosticInformation is denied; the authenticated command alone clears */
+    void *user;            /* of read_did */
+    void *reset_user;
 } upb_uds_config;
 
 typedef struct upb_uds {

@@ -1,0 +1,130 @@
+/*
+ * AES-128 (FIPS 197) encryption and CMAC (RFC 4493, NIST SP 800-38B). The S-box is computed, not looked up: no branch
+ * and no address depends on key or data, on any compiler that keeps masks as masks.
+ */
+#include <string.h>
+
+#include "upbeam/command.h"
+
+enum { BLOCK = 16, ROUNDS = 10 };
+
+typedef struct aes_key {
+    uint8_t round[ROUNDS + 1][BLOCK];
+} aes_key;
+
+/* x times the polynomial `x`, modulo x^8 + x^4 + x^3 + x + 1. */
+static uint8_t times_two(uint8_t x) { return (uint8_t)(x << 1 ^ (0x1b & -(x >> 7))); }
+
+static uint8_t multiply(uint8_t a, uint8_t b) {
+    uint8_t product = 0;
+    for (int bit = 0; bit < 8; bit++) {
+        product = (uint8_t)(product ^ (a & -(b >> bit & 1)));
+        a = times_two(a);
+    }
+    return product;
+}
+
+/* x^254: the inverse, and 0 for 0. 254 = 2 * (7 + 120) by way of 3, 7, 15, 120. */
+static uint8_t inverse(uint8_t x) {
+    const uint8_t x2 = multiply(x, x), x3 = multiply(x2, x);
+    const uint8_t x6 = multiply(x3, x3), x7 = multiply(x6, x);
+    const uint8_t x14 = multiply(x7, x7), x15 = multiply(x14, x);
+    const uint8_t x30 = multiply(x15, x15), x60 = multiply(x30, x30);
+    const uint8_t x120 = multiply(x60, x60), x127 = multiply(x120, x7);
+    return multiply(x127, x127);
+}
+
+static uint8_t rotated(uint8_t x, int by) { return (uint8_t)(x << by | x >> (8 - by)); }
+
+static uint8_t substitute(uint8_t x) {
+    const uint8_t y = inverse(x);
+    return (uint8_t)(y ^ rotated(y, 1) ^ rotated(y, 2) ^ rotated(y, 3) ^ rotated(y, 4) ^ 0x63);
+}
+
+static void expand_key(const uint8_t key[BLOCK], aes_key *expanded) {
+    uint8_t constant = 1;
+    memcpy(expanded->round[0], key, BLOCK);
+    for (int r = 1; r <= ROUNDS; r++) {
+        const uint8_t *before = expanded->round[r - 1];
+        uint8_t *now = expanded->round[r];
+        for (int i = 0; i < 4; i++)
+            now[i] = (uint8_t)(before[i] ^ substitute(before[12 + (i + 1) % 4]));
+        now[0] ^= constant;
+        constant = times_two(constant);
+        for (int i = 4; i < BLOCK; i++)
+            now[i] = before[i] ^ now[i - 4];
+    }
+}
+
+/* SubBytes and ShiftRows: row r of the column-wise state turns left by r. */
+static void substitute_and_shift(uint8_t state[BLOCK]) {
+    uint8_t out[BLOCK];
+    for (int column = 0; column < 4; column++)
+        for (int row = 0; row < 4; row++)
+            out[4 * column + row] = substitute(state[4 * ((column + row) % 4) + row]);
+    memcpy(state, out, BLOCK);
+}
+
+static void mix_columns(uint8_t state[BLOCK]) {
+    for (int column = 0; column < 4; column++) {
+        uint8_t *s = state + 4 * column;
+        const uint8_t all = s[0] ^ s[1] ^ s[2] ^ s[3], first = s[0];
+        for (int row = 0; row < 3; row++)
+            s[row] = (uint8_t)(s[row] ^ all ^ times_two(s[row] ^ s[row + 1]));
+        s[3] = (uint8_t)(s[3] ^ all ^ times_two(s[3] ^ first));
+    }
+}
+
+static void add(uint8_t state[BLOCK], const uint8_t *other) {
+    for (int i = 0; i < BLOCK; i++)
+        state[i] ^= other[i];
+}
+
+static void encrypt(const aes_key *key, uint8_t state[BLOCK]) {
+    add(state, key->round[0]);
+    for (int r = 1; r <= ROUNDS; r++) {
+        substitute_and_shift(state);
+        if (r < ROUNDS)
+            mix_columns(state);
+        add(state, key->round[r]);
+    }
+}
+
+/* Times x in the field of 128 bits (RFC 4493, 2.3): the subkeys. */
+static void double_block(uint8_t block[BLOCK]) {
+    const uint8_t carry = (uint8_t)(0x87 & -(block[0] >> 7));
+    for (int i = 0; i < BLOCK - 1; i++)
+        block[i] = (uint8_t)(block[i] << 1 | block[i + 1] >> 7);
+    block[BLOCK - 1] = (uint8_t)(block[BLOCK - 1] << 1 ^ carry);
+}
+
+/* A wipe the compiler may not leave out. */
+static void wipe(void *memory, size_t count) {
+    volatile uint8_t *p = memory;
+    while (count--)
+        *p++ = 0;
+}
+
+void upb_cmac(const uint8_t key[UPB_KEY_BYTES], const uint8_t *bytes, size_t count, uint8_t mac[16]) {
+    aes_key expanded;
+    uint8_t state[BLOCK] = {0}, last[BLOCK] = {0}, subkey[BLOCK] = {0};
+    expand_key(key, &expanded);
+    encrypt(&expanded, subkey);
+    double_block(subkey);
+    for (; count > BLOCK; count -= BLOCK, bytes += BLOCK) {
+        add(state, bytes);
+        encrypt(&expanded, state);
+    }
+    if (count)
+        memcpy(last, bytes, count);
+    if (count < BLOCK) {
+        last[count] = 0x80;
+        double_block(subkey);
+    }
+    add(last, subkey);
+    add(state, last);
+    encrypt(&expanded, state);
+    memcpy(mac, state, BLOCK);
+    wipe(&expanded, sizeof expanded);
+    wipe(subkey, sizeof subkey);
+}
