@@ -22,7 +22,7 @@ NAME = "upb_dbc"
 DEVICE = "UPBEAM"
 
 
-def _attribute(message: Message, name: str) -> int | str:
+def _attribute(message: Message, name: str) -> int | float | str:
     attributes = message.dbc.attributes if message.dbc else {}
     return attributes[name].value if name in attributes else 0
 
@@ -55,8 +55,8 @@ def _counters(db: Database) -> Iterator[str]:
 
 
 def _fault_list(db: Database) -> list[tuple[int, str]]:
-    choices = db.get_message_by_name("UPB_FaultDetail").get_signal_by_name("Fault").choices or {}
-    return sorted((number, str(name)) for number, name in choices.items())
+    signal = db.get_message_by_name("UPB_FaultDetail").get_signal_by_name("Fault")
+    return sorted((number, str(name)) for number, name in (signal.choices or {}).items())
 
 
 def _fault_bits(db: Database) -> Iterator[str]:
