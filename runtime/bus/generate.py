@@ -70,7 +70,7 @@ def _fault_bits(db: Database) -> Iterator[str]:
 
 def _fault_names(db: Database) -> Iterator[str]:
     yield "/* Names of faults by id. */"
-    yield "static const char *const dbc_fault_names[] = {"
+    yield "static const char dbc_fault_names[][32] = {"
     for number, name in _fault_list(db):
         yield f'    [{number}] = "{name}",'
     yield "};"

@@ -8,7 +8,8 @@
 
 enum { RESPONSE_NONE = 0, RESPONSE_CAN = 1, RESPONSE_SERIAL = 2 };
 
-#define SAVE_NS 1000000000u
+#define SAVE_SOON_NS 1000000000u
+#define SAVE_LATER_NS 60000000000u
 #define NEVER UINT64_MAX
 
 upb_bus_config upb_bus_config_default(void) {
@@ -286,9 +287,14 @@ static void keep_faults(upb_bus *bus, uint64_t now_ns) {
     heal(bus, UPB_FAULT_SERIAL_FRAMING, &bus->record_refused_ns, now_ns);
     if (bus->snapshot.state == UPB_STATE_RUNNING)
         upb_faults_report(&bus->faults, UPB_FAULT_POWER_RESET, UPB_MONITOR_PASSED, now_ns);
-    if (now_ns >= bus->save_ns && bus->faults.dirty) {
+}
+
+static void save_faults(upb_bus *bus, uint64_t now_ns) {
+    if ((bus->faults.dirty == UPB_FAULTS_SOON && now_ns >= bus->save_soon_ns) ||
+        (bus->faults.dirty == UPB_FAULTS_LATER && now_ns >= bus->save_later_ns)) {
         upb_faults_save(&bus->faults);
-        bus->save_ns = now_ns + SAVE_NS;
+        bus->save_soon_ns = now_ns + SAVE_SOON_NS;
+        bus->save_later_ns = now_ns + SAVE_LATER_NS;
     }
 }
 
@@ -298,6 +304,7 @@ void upb_bus_step(upb_bus *bus, const upb_bus_snapshot *snapshot, uint64_t now_n
     bus->now_ns = now_ns;
     upb_faults_context(&bus->faults, snapshot->record.frame, snapshot->mode);
     keep_faults(bus, now_ns);
+    save_faults(bus, now_ns);
     send_response(bus);
     serve_diagnostics(bus, now_ns);
     if (bus->config.can.send)

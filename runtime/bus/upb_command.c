@@ -9,7 +9,7 @@
 enum {
     FIRST_SIGNED = 3, /* bytes of the message under the MAC: from the code on, up to the MAC itself */
     MAC_AT = UPB_COMMAND_BYTES - UPB_MAC_BYTES,
-    MODES = 4,
+    MODES = UPB_DBC_UPB_STATUS_MODE_PASS_THROUGH_CHOICE + 1,
     STORED_MAGIC = 0x4655
 };
 
@@ -17,8 +17,8 @@ static const upb_e2e_config command_e2e = {UPB_COMMAND_DATA_ID, UPB_COMMAND_BYTE
 static const upb_e2e_config response_e2e = {UPB_RESPONSE_DATA_ID, UPB_COMMAND_BYTES, 2};
 
 const char *upb_command_result_text(uint32_t result) {
-    static const char *const texts[UPB_COMMAND_RESULTS] = {"DONE",    "E2E",     "NO_KEY", "MAC",    "STALE",
-                                                           "STORAGE", "UNKNOWN", "VALUE",  "REFUSED"};
+    static const char texts[UPB_COMMAND_RESULTS][8] = {"DONE",    "E2E",     "NO_KEY", "MAC",    "STALE",
+                                                       "STORAGE", "UNKNOWN", "VALUE",  "REFUSED"};
     return result < UPB_COMMAND_RESULTS ? texts[result] : "?";
 }
 

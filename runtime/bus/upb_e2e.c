@@ -123,18 +123,17 @@ upb_status upb_e2e_machine_init(upb_e2e_machine *machine, const upb_e2e_machine_
     return UPB_OK;
 }
 
-static void add_status(upb_e2e_machine *machine, upb_e2e_status status) {
-    if (machine->count == UPB_E2E_WINDOW_MAX) {
-        memmove(machine->window, machine->window + 1, UPB_E2E_WINDOW_MAX - 1);
-        machine->count--;
-    }
-    machine->window[machine->count++] = (uint8_t)status;
+/* Keeps the newest `window` statuses, this one with them. */
+static void add_status(upb_e2e_machine *machine, uint32_t window, upb_e2e_status status) {
+    const uint32_t kept = machine->count < window ? machine->count : window - 1;
+    memmove(machine->window, machine->window + (machine->count - kept), kept);
+    machine->window[kept] = (uint8_t)status;
+    machine->count = (uint8_t)(kept + 1);
 }
 
-/* Good checks and errors among the last `window` statuses. */
-static void count_statuses(const upb_e2e_machine *machine, uint32_t window, uint32_t *ok, uint32_t *errors) {
+static void count_statuses(const upb_e2e_machine *machine, uint32_t *ok, uint32_t *errors) {
     *ok = *errors = 0;
-    for (uint32_t i = machine->count > window ? machine->count - window : 0; i < machine->count; i++) {
+    for (uint32_t i = 0; i < machine->count; i++) {
         *ok += machine->window[i] == UPB_E2E_OK || machine->window[i] == UPB_E2E_OK_SOME_LOST;
         *errors += machine->window[i] == UPB_E2E_WRONG_CRC;
     }
@@ -156,8 +155,8 @@ upb_e2e_state upb_e2e_machine_step(upb_e2e_machine *machine, upb_e2e_status stat
                                    : machine->state == UPB_E2E_STATE_VALID ? &machine->config.valid
                                                                            : &machine->config.invalid;
     uint32_t ok, errors;
-    add_status(machine, status);
-    count_statuses(machine, limits->window, &ok, &errors);
+    add_status(machine, limits->window, status);
+    count_statuses(machine, &ok, &errors);
     if (errors <= limits->max_error && ok >= limits->min_ok)
         enter(machine, UPB_E2E_STATE_VALID);
     else if (machine->state == UPB_E2E_STATE_VALID || errors > limits->max_error)

@@ -124,13 +124,13 @@ upb_stored upb_faults_save(upb_faults *faults) {
         faults->store_failures++;
         return UPB_STORED_FAILED;
     }
-    faults->dirty = 0;
+    faults->dirty = UPB_FAULTS_CLEAN;
     return UPB_STORED_DONE;
 }
 
 upb_stored upb_faults_end(upb_faults *faults) {
     faults->ended = 1;
-    faults->dirty = 1;
+    faults->dirty = UPB_FAULTS_SOON;
     return upb_faults_save(faults);
 }
 
@@ -184,7 +184,7 @@ upb_status upb_faults_init(upb_faults *faults, const upb_storage *storage, uint6
         begin_cycle(&faults->entries[id]);
     faults->cycle++;
     faults->ended = 0;
-    faults->dirty = 1;
+    faults->dirty = UPB_FAULTS_SOON;
     upb_faults_report(faults, UPB_FAULT_POWER_RESET, ended ? UPB_MONITOR_PASSED : UPB_MONITOR_FAILED, now_ns);
     return UPB_OK;
 }
@@ -240,8 +240,12 @@ int upb_faults_report(upb_faults *faults, uint32_t id, upb_monitor look, uint64_
         entry->status &= (uint8_t)~UPB_DTC_TEST_FAILED;
     else if (!(before & UPB_DTC_TEST_FAILED))
         note_failure(faults, id, now_ns);
-    faults->dirty |= entry->status != before;
-    return (entry->status ^ before) & UPB_DTC_TEST_FAILED;
+    const uint8_t changed = entry->status ^ before;
+    if (changed & ~UPB_DTC_TEST_FAILED)
+        faults->dirty = UPB_FAULTS_SOON;
+    else if (changed && faults->dirty == UPB_FAULTS_CLEAN)
+        faults->dirty = UPB_FAULTS_LATER;
+    return changed & UPB_DTC_TEST_FAILED;
 }
 
 int upb_fault_is_active(const upb_faults *faults, uint32_t id) {
@@ -269,6 +273,6 @@ upb_status upb_faults_clear(upb_faults *faults, uint32_t id) {
         forget(&faults->entries[i]);
     if (id == 0 || faults->latest == id)
         faults->latest = 0;
-    faults->dirty = 1;
+    faults->dirty = UPB_FAULTS_SOON;
     return UPB_OK;
 }

@@ -1,7 +1,7 @@
 /* Written by upbeam.runtime.bus.generate from hw_sim/can/upbeam.dbc: change that. */
 
 /* Names of faults by id. */
-static const char *const dbc_fault_names[] = {
+static const char dbc_fault_names[][32] = {
     [0] = "NONE",
     [1] = "SENSOR_TIMEOUT",
     [2] = "SENSOR_AZIMUTH_STUCK",

@@ -98,7 +98,7 @@ typedef enum upb_message {
 
 /* A message as the DBC has it. */
 typedef struct upb_message_info {
-    const char *name;
+    char name[24];
     uint32_t id;
     uint32_t flags;     /* UPB_CAN_* */
     uint32_t cycle_ms;  /* 0: on event */
@@ -154,14 +154,15 @@ typedef struct upb_bus {
     uint64_t record_refused_ns;
     uint64_t records_unknown; /* good records that are no command */
     uint64_t now_ns;          /* of the last call */
-    uint64_t save_ns;         /* earliest next write of the fault memory */
-    uint64_t can_failed;      /* frames the transport dropped, all senders */
+    uint64_t save_soon_ns;    /* earliest next writes of the fault memory */
+    uint64_t save_later_ns;
+    uint64_t can_failed; /* frames the transport dropped, all senders */
     uint64_t serial_failed;
     uint8_t response_pending; /* the transport had no room for the response: 1 CAN, 2 serial */
     upb_can_frame response;
 } upb_bus;
 
-/* Reads storage, begins an operation cycle. Errors: ARGUMENT. */
+/* Reads storage, begins an operation cycle. The object stays where it is: its parts point at it. Errors: ARGUMENT. */
 UPB_API upb_status upb_bus_init(upb_bus *bus, const upb_bus_config *config, uint64_t now_ns);
 /* A CAN frame received: command or diagnostics; true if it was for this device. */
 UPB_API int upb_bus_can(upb_bus *bus, const upb_can_frame *frame, uint64_t now_ns);
@@ -172,7 +173,7 @@ UPB_API void upb_bus_ledger(upb_bus *bus, const upb_ledger_record *record);
 /*
  * Sends what is due: status messages, ledger records, diagnostics. Keeps the faults that are the bus's own: CAN_BUS_OFF
  * (the transport fails), CAN_COMMAND_REJECTED and SERIAL_FRAMING (healed UPB_BUS_HEAL_NS after the last refusal),
- * POWER_RESET (healed when the state is RUNNING). Writes the fault memory at most once a second.
+ * POWER_RESET (healed when the state is RUNNING). Writes the fault memory (upb_faults_save).
  */
 UPB_API void upb_bus_step(upb_bus *bus, const upb_bus_snapshot *snapshot, uint64_t now_ns);
 /* The end in good order (upb_faults_end). */

@@ -94,6 +94,9 @@ typedef struct upb_fault_entry {
     uint64_t frame; /* frame at the last failure */
 } upb_fault_entry;
 
+/* A new fault is stored soon; that a known one came or went may wait, so that nobody wears the storage out. */
+typedef enum upb_faults_dirty { UPB_FAULTS_CLEAN = 0, UPB_FAULTS_LATER = 1, UPB_FAULTS_SOON = 2 } upb_faults_dirty;
+
 typedef struct upb_faults {
     upb_fault_entry entries[UPB_FAULTS + 1u]; /* by id */
     upb_debounce debounce[UPB_FAULTS + 1u];
@@ -101,7 +104,7 @@ typedef struct upb_faults {
     uint32_t latest;         /* id that failed last, 0: none */
     uint32_t cycle;          /* operation cycles begun, this one with them */
     uint32_t ended;          /* upb_faults_end was called */
-    uint32_t dirty;          /* differs from what is stored */
+    uint32_t dirty;          /* upb_faults_dirty: whether and how soon to store */
     uint32_t store_failures; /* writes refused, and a stored memory that could not be read */
     uint64_t frame;          /* upb_faults_context */
     uint32_t mode;
@@ -128,7 +131,8 @@ UPB_API uint32_t upb_faults_count(const upb_faults *faults, uint8_t mask);
 UPB_API upb_status upb_faults_clear(upb_faults *faults, uint32_t id);
 /*
  * Writes the memory if it changed; a write that failed is tried again at the next call. upb_bus_step calls it at most
- * once a second, upb_bus_end always. Without a write function: UPB_STORED_DONE, nothing is kept.
+ * once a second for what is to be stored soon, once a minute for the rest; upb_bus_end always. Without a write
+ * function: UPB_STORED_DONE, nothing is kept.
  */
 UPB_API upb_stored upb_faults_save(upb_faults *faults);
 /* Ends the operation cycle in good order and writes the memory: the next start finds no POWER_RESET. */

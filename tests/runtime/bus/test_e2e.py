@@ -89,22 +89,24 @@ def restated_machine(
 ) -> list[int]:
     """The state machine of PRS_E2EProtocol in its own words: numbers of good and wrong checks among the last few."""
     states = ["NODATA", "INIT", "VALID", "INVALID"]
-    state, history, path = "NODATA", [], []
+    state = "NODATA"
+    history: list[int] = []
+    path = []
     for status in statuses:
         if state == "NODATA":
             if status not in (WRONG_CRC, NO_NEW_DATA):
                 state = "INIT"
         else:
-            history.append(status)
             size, least, most = windows[state]
-            good = sum(s in (OK, SOME_LOST) for s in history[-size:])
-            wrong = sum(s == WRONG_CRC for s in history[-size:])
+            history = [*history, status][-size:]
+            good = sum(s in (OK, SOME_LOST) for s in history)
+            wrong = history.count(WRONG_CRC)
             if wrong <= most and good >= least:
                 state = "VALID"
             elif (state == "INIT" and wrong > most) or state == "VALID":
                 state = "INVALID"
                 if clear_to_invalid:
-                    history.clear()
+                    history = []
         path.append(states.index(state))
     return path
 

@@ -1,9 +1,9 @@
 #!/bin/sh
-# Usage: check_symbols.sh NM LIBRARY.a LIBRARY.so
+# Usage: check_symbols.sh NM LIBRARY.a [LIBRARY.so]
 # The library needs nothing but a few functions of libc and libm (no heap, no files, no threads), holds no writable data,
 # and exports nothing but upb_ names.
 set -eu
-nm=$1 static=$2 shared=$3
+nm=$1 static=$2 shared=${3:-}
 
 # What the compiler may call on its own is there too: memory and stack protection, the table of a shared object.
 allowed='^(mem(cpy|move|set|cmp)|bcmp|str(len|ncat|ncpy)|floorf|getauxval|__stack_chk_fail|__(memcpy|memset|strncat|strncpy)_chk|_GLOBAL_OFFSET_TABLE_)$'
@@ -13,8 +13,8 @@ defined=$("$nm" "$static" | awk 'NF == 3 && $2 ~ /[TtRr]/ { print $3 }' | sort -
 needed=$("$nm" "$static" | awk 'NF == 2 && $1 == "U" { print $2 }' | sort -u)
 foreign=$(printf '%s\n' "$needed" | grep -vxF "$defined" | grep -vE "$allowed" || true)
 writable=$("$nm" "$static" | awk 'NF == 3 && $2 ~ /[BbDdCcSsGg]/ { print $2, $3 }')
-exported=$("$nm" -D --defined-only "$shared" | awk '{ print $NF }' | grep -vE '^upb_' || true)
-internal=$("$nm" -D --defined-only "$shared" | awk '{ print $NF }' | grep -E '^upb_(kernels_|fail|check_memory|offset_)' || true)
+exported=$([ -z "$shared" ] || "$nm" -D --defined-only "$shared" | awk '{ print $NF }' | grep -vE '^upb_' || true)
+internal=$([ -z "$shared" ] || "$nm" -D --defined-only "$shared" | awk '{ print $NF }' | grep -E '^upb_(kernels_|fail|check_memory|offset_)' || true)
 
 status=0
 for finding in "foreign" "writable" "exported" "internal"; do

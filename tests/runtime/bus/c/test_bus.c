@@ -278,6 +278,24 @@ static void test_fault_cycles(void) {
     CHECK_EQUAL(upb_bus_end(&device.bus), UPB_STORED_FAILED);
 }
 
+/* A fault that comes and goes all the time does not wear the storage out; a new one is kept at once. */
+static void test_storage_wear(void) {
+    new_device();
+    bench_start(&device, bench_key);
+    bench_step(&device, 2000);
+    const unsigned first = device.store.writes[UPB_STORE_FAULTS];
+    for (int i = 0; i < 300; i++) {
+        upb_faults_report(&device.bus.faults, UPB_FAULT_NET_LOSS, UPB_MONITOR_FAILED, device.now_ns);
+        bench_step(&device, 1000);
+        upb_faults_report(&device.bus.faults, UPB_FAULT_NET_LOSS, UPB_MONITOR_PASSED, device.now_ns);
+    }
+    CHECK_EQUAL(device.store.writes[UPB_STORE_FAULTS] - first, 1 + 300 / 60 - 1);
+    upb_faults_report(&device.bus.faults, UPB_FAULT_NET_REORDER, UPB_MONITOR_FAILED, device.now_ns);
+    const unsigned before = device.store.writes[UPB_STORE_FAULTS];
+    bench_step(&device, 1);
+    CHECK_EQUAL(device.store.writes[UPB_STORE_FAULTS], before + 1);
+}
+
 /* -------------------------------------------------------------------------------------------------- sender */
 
 static void test_cycle_times(void) {
@@ -397,6 +415,7 @@ int main(void) {
     test_command_storage();
     test_debounce();
     test_fault_cycles();
+    test_storage_wear();
     test_cycle_times();
     test_busy_and_failing();
     test_status_command();
