@@ -4,6 +4,7 @@
  */
 #include <string.h>
 
+#include "upb_bytes.h"
 #include "upbeam/command.h"
 
 enum { BLOCK = 16, ROUNDS = 10 };
@@ -12,33 +13,47 @@ typedef struct aes_key {
     uint8_t round[ROUNDS + 1][BLOCK];
 } aes_key;
 
-/* x times the polynomial `x`, modulo x^8 + x^4 + x^3 + x + 1. */
-static uint8_t times_two(uint8_t x) { return (uint8_t)(x << 1 ^ (0x1b & -(x >> 7))); }
+/* Eight field elements, one in each byte of a word: the arithmetic works on all of them at once. */
+typedef uint64_t lanes;
 
-static uint8_t multiply(uint8_t a, uint8_t b) {
-    uint8_t product = 0;
+#define EACH(byte) (UINT64_C(0x0101010101010101) * (byte))
+
+/* 0xff in each byte whose lowest bit is set in `bits`, 0 elsewhere. */
+static lanes mask_of(lanes bits) {
+    bits &= EACH(1);
+    return (bits << 8) - bits;
+}
+
+/* x times the polynomial `x`, modulo x^8 + x^4 + x^3 + x + 1. */
+static lanes times_two(lanes x) { return (x << 1 & EACH(0xfe)) ^ (mask_of(x >> 7) & EACH(0x1b)); }
+
+static lanes multiply(lanes a, lanes b) {
+    lanes product = 0;
     for (int bit = 0; bit < 8; bit++) {
-        product = (uint8_t)(product ^ (a & -(b >> bit & 1)));
+        product ^= a & mask_of(b >> bit);
         a = times_two(a);
     }
     return product;
 }
 
-/* x^254: the inverse, and 0 for 0. 254 = 2 * (7 + 120) by way of 3, 7, 15, 120. */
-static uint8_t inverse(uint8_t x) {
-    const uint8_t x2 = multiply(x, x), x3 = multiply(x2, x);
-    const uint8_t x6 = multiply(x3, x3), x7 = multiply(x6, x);
-    const uint8_t x14 = multiply(x7, x7), x15 = multiply(x14, x);
-    const uint8_t x30 = multiply(x15, x15), x60 = multiply(x30, x30);
-    const uint8_t x120 = multiply(x60, x60), x127 = multiply(x120, x7);
+/* x^254: the inverse, and 0 for 0. 254 = 2 * (120 + 7), by way of 3, 7, 15. */
+static lanes inverse(lanes x) {
+    const lanes x2 = multiply(x, x), x3 = multiply(x2, x);
+    const lanes x6 = multiply(x3, x3), x7 = multiply(x6, x);
+    const lanes x14 = multiply(x7, x7), x15 = multiply(x14, x);
+    const lanes x30 = multiply(x15, x15), x60 = multiply(x30, x30);
+    const lanes x120 = multiply(x60, x60), x127 = multiply(x120, x7);
     return multiply(x127, x127);
 }
 
-static uint8_t rotated(uint8_t x, int by) { return (uint8_t)(x << by | x >> (8 - by)); }
+static lanes rotated(lanes x, int by) {
+    const lanes low = EACH((1u << by) - 1u);
+    return (x << by & ~low) | (x >> (8 - by) & low);
+}
 
-static uint8_t substitute(uint8_t x) {
-    const uint8_t y = inverse(x);
-    return (uint8_t)(y ^ rotated(y, 1) ^ rotated(y, 2) ^ rotated(y, 3) ^ rotated(y, 4) ^ 0x63);
+static lanes substitute(lanes x) {
+    const lanes y = inverse(x);
+    return y ^ rotated(y, 1) ^ rotated(y, 2) ^ rotated(y, 3) ^ rotated(y, 4) ^ EACH(0x63);
 }
 
 static void expand_key(const uint8_t key[BLOCK], aes_key *expanded) {
@@ -47,10 +62,11 @@ static void expand_key(const uint8_t key[BLOCK], aes_key *expanded) {
     for (int r = 1; r <= ROUNDS; r++) {
         const uint8_t *before = expanded->round[r - 1];
         uint8_t *now = expanded->round[r];
+        const lanes last = substitute(upb_get_le(before + 12, 4));
         for (int i = 0; i < 4; i++)
-            now[i] = (uint8_t)(before[i] ^ substitute(before[12 + (i + 1) % 4]));
+            now[i] = (uint8_t)(before[i] ^ (last >> 8 * ((i + 1) % 4)));
         now[0] ^= constant;
-        constant = times_two(constant);
+        constant = (uint8_t)times_two(constant);
         for (int i = 4; i < BLOCK; i++)
             now[i] = before[i] ^ now[i - 4];
     }
@@ -58,21 +74,25 @@ static void expand_key(const uint8_t key[BLOCK], aes_key *expanded) {
 
 /* SubBytes and ShiftRows: row r of the column-wise state turns left by r. */
 static void substitute_and_shift(uint8_t state[BLOCK]) {
-    uint8_t out[BLOCK];
+    uint8_t all[BLOCK];
+    upb_put_le(all, substitute(upb_get_le(state, 8)), 8);
+    upb_put_le(all + 8, substitute(upb_get_le(state + 8, 8)), 8);
     for (int column = 0; column < 4; column++)
         for (int row = 0; row < 4; row++)
-            out[4 * column + row] = substitute(state[4 * ((column + row) % 4) + row]);
-    memcpy(state, out, BLOCK);
+            state[4 * column + row] = all[4 * ((column + row) % 4) + row];
+}
+
+/* MixColumns, two columns in a word: 2 s[r] + 3 s[r+1] + s[r+2] + s[r+3] in each row. */
+static lanes mixed(lanes s) {
+    const lanes three = UINT64_C(0x00ffffff00ffffff), two = UINT64_C(0x0000ffff0000ffff);
+    const lanes next = (s >> 8 & three) | (s << 24 & ~three);                         /* s[r+1] */
+    const lanes pair = s ^ next, far_pair = (pair >> 16 & two) | (pair << 16 & ~two); /* s[r+2] + s[r+3] */
+    return times_two(pair) ^ next ^ far_pair;
 }
 
 static void mix_columns(uint8_t state[BLOCK]) {
-    for (int column = 0; column < 4; column++) {
-        uint8_t *s = state + 4 * column;
-        const uint8_t all = s[0] ^ s[1] ^ s[2] ^ s[3], first = s[0];
-        for (int row = 0; row < 3; row++)
-            s[row] = (uint8_t)(s[row] ^ all ^ times_two(s[row] ^ s[row + 1]));
-        s[3] = (uint8_t)(s[3] ^ all ^ times_two(s[3] ^ first));
-    }
+    upb_put_le(state, mixed(upb_get_le(state, 8)), 8);
+    upb_put_le(state + 8, mixed(upb_get_le(state + 8, 8)), 8);
 }
 
 static void add(uint8_t state[BLOCK], const uint8_t *other) {
