@@ -96,13 +96,13 @@ static size_t put_list(const uint64_t *values, size_t count, uint8_t *bytes) {
     return 8 * count;
 }
 
-/* The longest list, of counters, is 136 bytes: UDS gives room for a whole ISO-TP message. */
-static size_t read_did(void *user, uint32_t did, uint8_t *bytes, size_t room) {
-    const upb_bus *bus = user;
+enum { DID_BYTES_MAX = 8 * UPB_COUNTERS };
+
+/* At most DID_BYTES_MAX bytes: the counters. */
+static size_t put_did(const upb_bus *bus, uint32_t did, uint8_t *bytes) {
     const upb_bus_snapshot *now = &bus->snapshot;
     const uint64_t latency[2] = {now->record.latency_ns, now->latency_max_ns};
     uint64_t counters[UPB_COUNTERS];
-    (void)room;
     switch (did) {
     case UPB_DID_VERSION:
         memcpy(bytes, UPB_VERSION_TEXT, sizeof UPB_VERSION_TEXT - 1);
@@ -129,6 +129,18 @@ static size_t read_did(void *user, uint32_t did, uint8_t *bytes, size_t room) {
     }
 }
 
+_Static_assert(UPB_DROP_CAUSES_MAX <= UPB_COUNTERS && UPB_COMMAND_RESULTS <= UPB_COUNTERS &&
+                   sizeof(upb_ledger_record) <= DID_BYTES_MAX && sizeof UPB_VERSION_TEXT <= DID_BYTES_MAX,
+               "the counters are the longest data");
+
+static size_t read_did(void *user, uint32_t did, uint8_t *bytes, size_t room) {
+    uint8_t data[DID_BYTES_MAX];
+    const size_t count = put_did(user, did, data);
+    if (count <= room)
+        memcpy(bytes, data, count);
+    return count;
+}
+
 static void serve_diagnostics(upb_bus *bus, uint64_t now_ns) {
     uint8_t answer[UPB_ISOTP_BYTES];
     size_t count;
@@ -145,6 +157,13 @@ static void serve_diagnostics(upb_bus *bus, uint64_t now_ns) {
 
 /* ----------------------------------------------------------------------------------------------- commands */
 
+/* What the program makes of it; only results that are its to give. */
+static upb_command_result run(const upb_commands *commands, const upb_command *command) {
+    const upb_command_result result =
+        commands->execute ? commands->execute(commands->user, command) : UPB_COMMAND_REFUSED;
+    return result == UPB_COMMAND_DONE || result == UPB_COMMAND_VALUE ? result : UPB_COMMAND_REFUSED;
+}
+
 static upb_command_result execute(upb_bus *bus, const upb_command *command, uint64_t now_ns) {
     switch (command->code) {
     case UPB_COMMAND_STATUS:
@@ -154,9 +173,7 @@ static upb_command_result execute(upb_bus *bus, const upb_command *command, uint
     case UPB_COMMAND_CLEAR_FAULTS:
         return upb_faults_clear(&bus->faults, command->argument) == UPB_OK ? UPB_COMMAND_DONE : UPB_COMMAND_VALUE;
     default:
-        if (!bus->commands.execute)
-            return UPB_COMMAND_REFUSED;
-        return bus->commands.execute(bus->commands.user, command);
+        return run(&bus->commands, command);
     }
 }
 
@@ -196,7 +213,7 @@ static void take_command(upb_bus *bus, const upb_can_frame *frame, uint8_t chann
     upb_command_result result = upb_command_accept(&bus->commands, frame->data, frame->length, &command);
     if (result == UPB_COMMAND_DONE) {
         result = execute(bus, &command, now_ns);
-        bus->commands.results[(uint32_t)result < UPB_COMMAND_RESULTS ? result : UPB_COMMAND_REFUSED]++;
+        bus->commands.results[result]++;
     }
     if (result == UPB_COMMAND_DONE) {
         upb_faults_report(&bus->faults, UPB_FAULT_CAN_COMMAND_REJECTED, UPB_MONITOR_PASSED, now_ns);

@@ -126,6 +126,8 @@ static nrc count_faults(upb_uds *uds, const request *in, answer *out) {
     return NRC_NONE;
 }
 
+_Static_assert(3 + 4 * UPB_FAULTS <= UPB_ISOTP_BYTES, "the list of all faults fits a message");
+
 /* Every fault whose status has a bit of `mask`; all of them for `mask` 0. */
 static nrc list_faults(upb_uds *uds, uint8_t mask, answer *out) {
     put(out, UPB_DTC_STATUS_MASK, 1);
@@ -204,26 +206,30 @@ static nrc read_faults(upb_uds *uds, const request *in, answer *out) {
     }
 }
 
+/* Bytes of an identifier's data, 0 for an unknown one; written to `bytes` if they fit `room`. */
+static size_t read_did(const upb_uds *uds, uint32_t did, uint8_t *bytes, size_t room) {
+    if (did != UPB_DID_SESSION)
+        return uds->config.read_did(uds->config.user, did, bytes, room);
+    if (room)
+        bytes[0] = uds->session;
+    return 1;
+}
+
 static nrc read_dids(upb_uds *uds, const request *in, answer *out) {
     if (in->count < 3 || in->count % 2 == 0 || in->count > 1 + 2 * DIDS_MAX)
         return NRC_LENGTH;
     int known = 0;
     for (size_t at = 1; at < in->count; at += 2) {
-        uint8_t data[UPB_ISOTP_BYTES];
         const uint32_t did = (uint32_t)upb_get_be(in->bytes + at, 2);
-        size_t count = 1;
-        if (did == UPB_DID_SESSION)
-            data[0] = uds->session;
-        else
-            count = uds->config.read_did(uds->config.user, did, data, sizeof data);
+        const size_t used = out->count + 2, room = used < UPB_ISOTP_BYTES ? UPB_ISOTP_BYTES - used : 0;
+        const size_t count = read_did(uds, did, out->bytes + (room ? used : 0), room);
         if (!count)
             continue;
-        known++;
-        if (out->count + 2 + count > UPB_ISOTP_BYTES)
+        if (count > room)
             return NRC_TOO_LONG;
         put(out, did, 2);
-        memcpy(out->bytes + out->count, data, count);
         out->count += count;
+        known = 1;
     }
     return known ? NRC_NONE : NRC_OUT_OF_RANGE;
 }

@@ -68,8 +68,8 @@ typedef struct upb_response {
 } upb_response;
 
 /*
- * Carries out a command that was found authentic and fresh: DONE, VALUE or REFUSED. UPB_COMMAND_STATUS and
- * UPB_COMMAND_CLEAR_FAULTS do not come here.
+ * Carries out a command that was found authentic and fresh: DONE, VALUE or REFUSED (other results count as that).
+ * UPB_COMMAND_STATUS and UPB_COMMAND_CLEAR_FAULTS do not come here.
  */
 typedef upb_command_result (*upb_command_fn)(void *user, const upb_command *command);
 

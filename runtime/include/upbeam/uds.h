@@ -86,7 +86,7 @@ typedef enum upb_did {
 } upb_did;                      /* all numbers big-endian, as UDS has them */
 
 typedef struct upb_uds_config {
-    /* Writes the data of `did` (at most `room` bytes); how many, 0 for an unknown one. */
+    /* Bytes of the data of `did`, 0 for an unknown one; written to `bytes` if they fit `room`. */
     size_t (*read_did)(void *user, uint32_t did, uint8_t *bytes, size_t room);
     /* ECUReset: true if the device will reset after the answer. Null: service not supported. */
     int (*reset)(void *user, uint32_t type);

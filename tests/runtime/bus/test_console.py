@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
 from cobs import cobs
 from crccheck.crc import Crc16Ibm3740
 from hypothesis import given
@@ -71,3 +74,17 @@ def test_serial_framing_fault_sets_and_heals(desk) -> None:  # type: ignore[no-u
     assert desk.device.serial_refused == 3
     desk.run(5001)
     assert not desk.device.faults_active
+
+
+CORPUS = [
+    [cell.strip() for cell in line.split("|")]
+    for line in (Path(__file__).parent / "corpus" / "serial.txt").read_text().splitlines()
+    if not line.startswith("#")
+]
+
+
+@pytest.mark.parametrize(("stream", "good", "refused"), [row[1:] for row in CORPUS], ids=[row[0] for row in CORPUS])
+def test_corpus(stream: str, good: str, refused: str) -> None:
+    parser = Parser()
+    assert len(parser.feed(bytes.fromhex(stream))) == int(good)
+    assert parser.refused == int(refused)
