@@ -33,7 +33,7 @@ def test_crcs_agree_with_another_implementation(data: bytes) -> None:
 
 @pytest.mark.parametrize(
     ("profile", "data_id", "counter", "expected"),
-    [  # the protect examples of AUTOSAR FO PRS_E2EProtocol: eight bytes of zeros
+    [  # the protect examples of AUTOSAR FO PRS_E2EProtocol, as public implementations quote them: eight bytes of zeros
         (11, 0x123, 0, "2a10000000000000"),
         (11, 0x123, 1, "7711000000000000"),
         (5, 0x1234, 0, "1cca000000000000"),

@@ -17,7 +17,10 @@ static void test_crc(void) {
     CHECK_EQUAL(upb_crc16(UPB_CRC16_START, "123456789", 9), 0x29b1); /* CRC-16/IBM-3740, Crc_CalculateCRC16 */
 }
 
-/* The protect examples of AUTOSAR FO PRS_E2EProtocol: eight bytes of zeros, data ids 0x123 (11C) and 0x1234 (5). */
+/*
+ * The protect examples of AUTOSAR FO PRS_E2EProtocol, as public implementations quote them: eight bytes of zeros, data
+ * ids 0x123 (11C) and 0x1234 (5).
+ */
 static void test_e2e_examples(void) {
     const upb_e2e_config p11 = {0x123, 8, 1}, p05 = {0x1234, 8, 1};
     uint8_t data[8] = {0}, counter = 0;
