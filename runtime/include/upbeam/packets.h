@@ -53,7 +53,7 @@ typedef enum upb_packet_status {
     UPB_PACKET_E_SENSOR = 8,       /* of another sensor than the decoder's */
     UPB_PACKET_E_POSITION = 9,     /* a position packet's PPS or thermal byte is none known, or its NMEA is not text */
     UPB_PACKET_E_CALIBRATION = 10, /* a calibration that cannot be: laser_id not unique, elevation not falling, ... */
-    UPB_PACKET_E_RETURN_PAIR = 11, /* dual return, and the two blocks of a pair do not share their azimuth */
+    UPB_PACKET_E_RETURN_PAIR = 11, /* blocks of one firing do not share their azimuth */
     /* Known and refused, by name. */
     UPB_PACKET_E_VLS_128 = 12,
     UPB_PACKET_E_VLP_32AB = 13,
@@ -144,12 +144,13 @@ upb_packet_status upb_packet_calibration_check(const upb_packet_calibration *cal
 void upb_packet_calibration_sort(upb_packet_calibration *calibration);
 /*
  * The table of an HDL-64E S3 that a 64-row column is written as: row 2k (measured) is laser k in the upper bank,
- * 0xEEFF; row 2k+1 (generated) laser 32+k in the lower, 0xDDFF. All corrections are 0 except azimuth_offset_mdeg, which
- * takes back the turn that drivers add for each laser's firing time, at `rpm_milli` thousandths of a turn per minute:
- * so all rows of a column are decoded at its azimuth. Elevations fall strictly and differ after rounding to 0.01
- * degrees, or E_CALIBRATION.
+ * 0xEEFF; row 2k+1 (generated) laser 32+k in the lower, 0xDDFF. All corrections are 0 but azimuth_offset_mdeg, which
+ * takes back the turn that drivers add for each laser's firing time. They reckon it from the azimuths in the packets
+ * and an S3's own cycle, so it depends on the azimuth from column to column: on turn_columns, the columns of a full
+ * turn at nominal speed (4..65535). All rows of a column are then decoded at its azimuth; at another speed they spread
+ * (docs/packets.md). Elevations fall strictly and differ after rounding to 0.01 degrees, or E_CALIBRATION.
  */
-upb_packet_status upb_packet_calibration_rows(const int32_t row_elevation_mdeg[UPB_PACKET_BEAMS], uint32_t rpm_milli,
+upb_packet_status upb_packet_calibration_rows(const int32_t row_elevation_mdeg[UPB_PACKET_BEAMS], uint32_t turn_columns,
                                               upb_packet_calibration *calibration);
 
 /* ------------------------------------------------------------------------------------------------------- identify */
@@ -259,9 +260,9 @@ upb_packet_status upb_record_read(const uint8_t record[UPB_RECORD_BYTES], upb_pa
 
 /* Of a dual return's two firings, the primary: the one for the network. */
 typedef enum upb_pick {
-    UPB_PICK_STRONGEST = 0, /* beam by beam the brighter return. The sensor puts the last return into the first block,
-                               and the strongest into the second: unless these are one, then the second strongest. */
-    UPB_PICK_LAST = 1       /* the first block, whole; the second firing is the second block, whole */
+    UPB_PICK_STRONGEST = 0, /* beam by beam the brighter return, the other one in the second firing: where the last
+                               return is the strongest, sensors send the second strongest in the strongest's place */
+    UPB_PICK_LAST = 1       /* the block of last returns, whole; the second firing is the other block, whole */
 } upb_pick;
 
 typedef struct upb_packet_decoder_config {
@@ -391,12 +392,13 @@ upb_packet_status upb_position_encode(const upb_position *position, uint8_t byte
 
 /* ------------------------------------------------------------------------------------------------ azimuth tracking */
 
-#define UPB_STEP_FIRST 1u      /* the first firing */
-#define UPB_STEP_FRAME 2u      /* crossed the cut: first firing of its frame */
-#define UPB_STEP_LATE 4u       /* behind the last one: reordered or a duplicate; the tracker stays where it was */
-#define UPB_STEP_STUCK 8u      /* time went on, the azimuth did not */
-#define UPB_STEP_TIME_JUMP 16u /* the sensor's clock and its azimuth tell different stories: the azimuth is believed   \
-                                */
+#define UPB_STEP_FIRST 1u /* the first firing */
+#define UPB_STEP_FRAME 2u /* crossed the cut: first firing of its frame */
+#define UPB_STEP_LATE 4u  /* behind the last one: reordered or a duplicate; the tracker stays where it was */
+#define UPB_STEP_STUCK 8u /* time went on, the azimuth did not */
+#define UPB_STEP_TIME_JUMP                                                                                             \
+    16u /* the sensor's clock and its azimuth tell different stories: the azimuth is believed                          \
+         */
 #define UPB_STEP_RESTART                                                                                               \
     32u /* more than UPB_TRACKER_LOST_NS without a firing, or the clock went back: nothing is known                    \
            of what lies between; `missing` is 0 */
