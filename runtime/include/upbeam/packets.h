@@ -51,8 +51,8 @@ typedef enum upb_packet_status {
     UPB_PACKET_E_RETURN_MODE = 6,  /* the return mode byte is none of strongest, last, dual */
     UPB_PACKET_E_MODEL = 7,        /* the model byte is no sensor known */
     UPB_PACKET_E_SENSOR = 8,       /* of another sensor than the decoder's */
-    UPB_PACKET_E_POSITION = 9,     /* a position packet's PPS or thermal byte is none known, or its NMEA is not text */
-    UPB_PACKET_E_CALIBRATION = 10, /* a calibration that cannot be: laser_id not unique, elevation not falling, ... */
+    UPB_PACKET_E_POSITION = 9,     /* a position packet's PPS state is none known, or its NMEA sentence is not text */
+    UPB_PACKET_E_CALIBRATION = 10, /* a calibration that cannot be: laser_id not unique, elevation rising, ... */
     UPB_PACKET_E_RETURN_PAIR = 11, /* blocks of one firing do not share their azimuth */
     /* Known and refused, by name. */
     UPB_PACKET_E_VLS_128 = 12,
@@ -137,8 +137,8 @@ typedef struct upb_packet_calibration {
 
 /* The nominal table of a sensor (model/beam_tables). E_ARGUMENT for a sensor that is not decoded. */
 upb_packet_status upb_packet_calibration_default(upb_sensor sensor, upb_packet_calibration *calibration);
-/* Laser numbers unique and of the sensor, elevations falling within +-90 degrees, offsets within +-90, times in the
- * cycle, intensities in order. E_CALIBRATION, and *beam is the first bad one (may be null). */
+/* Laser numbers unique and of the sensor, elevations never rising, within +-90 degrees, offsets within +-90, times in
+ * the cycle, intensities in order. E_CALIBRATION, and *beam is the first bad one (may be null). */
 upb_packet_status upb_packet_calibration_check(const upb_packet_calibration *calibration, uint32_t *beam);
 /* Sorts the lasers top beam first. */
 void upb_packet_calibration_sort(upb_packet_calibration *calibration);
@@ -184,9 +184,11 @@ upb_packet_status upb_packet_identify(const uint8_t *bytes, size_t n, upb_packet
 
 #define UPB_FIRING_SECOND 1u       /* the other return of a dual pair: follows its primary, same azimuth and time */
 #define UPB_FIRING_INTERPOLATED 2u /* its azimuth stands in no block: the second firing of a VLP-16's block */
-#define UPB_FIRING_JUMP 4u         /* within its packet, the azimuth jumped just before it */
-#define UPB_FIRING_EMPTY 8u        /* no beam has a return */
-#define UPB_FIRING_DUAL 16u        /* of a dual-return packet, primary or second */
+/* Within its packet, the azimuth jumped just before it: a sensor told to send a part of the turn leaves out the rest.
+ * Its time, and of those behind it, is then reckoned from the azimuth: packets tell it of their first firing only. */
+#define UPB_FIRING_JUMP 4u
+#define UPB_FIRING_EMPTY 8u /* no beam has a return */
+#define UPB_FIRING_DUAL 16u /* of a dual-return packet, primary or second */
 
 typedef struct upb_firing {
     uint64_t time_ns;      /* begin of the firing by the sensor's clock. Goes on past the hour: time_ns % UPB_HOUR_NS is
@@ -210,8 +212,8 @@ typedef struct upb_point {
     uint32_t distance_um;  /* corrected */
 } upb_point;
 
-/* Points of a firing's returns, top beam first; returns how many (at most firing->beams). Intensity is not corrected.
- */
+/* Points of a firing's returns, top beam first; returns how many (at most firing->beams, 0 for a calibration that
+ * cannot be). A return that the distance correction takes to 0 or below is no point. Intensity is not corrected. */
 uint32_t upb_firing_points(const upb_packet_calibration *calibration, const upb_firing *firing,
                            upb_point points[UPB_PACKET_BEAMS]);
 
@@ -411,7 +413,7 @@ typedef struct upb_step {
     int64_t firing;   /* running number, lost ones included: 0 is the first. Late: that of its place, may be negative */
     int64_t angle_mdeg; /* since the cut before the first firing; a turn adds 360000 */
     uint64_t frame;     /* turns begun since the first firing, by the cut */
-    uint32_t rpm_milli; /* thousandths of a turn per minute, smoothed over about a 16th of a turn; 0: unknown */
+    uint32_t rpm_milli; /* thousandths of a turn per minute, smoothed over some 32 firings; 0: unknown */
 } upb_step;
 
 typedef struct upb_azimuth_tracker {
@@ -422,6 +424,7 @@ typedef struct upb_azimuth_tracker {
     uint64_t time_ns;
     int64_t firing;
     int64_t angle_mdeg;
+    uint64_t frame;
     uint64_t rate_mdeg_s_q8;
 } upb_azimuth_tracker;
 

@@ -1,0 +1,1 @@
+"""Packets of Velodyne sensors: decoding, encoding, captures."""
