@@ -21,26 +21,24 @@ static double near_correction_um(double far_um, double near_um, double near_at_u
     return (far_um - near_um) * (along_um - near_at_um) / (FAR_UM - near_at_um) + near_um - far_um;
 }
 
+/* The origin lies `up` over the sensor's and `left` of the direction: a shift, whatever the elevation. */
 static void place_point(const upb_laser *laser, int two_point, double distance_um, upb_point *point) {
     const double azimuth = point->azimuth_mdeg * radians_per_mdeg;
     const double elevation = laser->elevation_mdeg * radians_per_mdeg;
     const double sin_a = sin(azimuth), cos_a = cos(azimuth), sin_e = sin(elevation), cos_e = cos(elevation);
-    const double up = laser->vertical_offset_um;
     const double left = laser->horizontal_offset_um;
     double right_um = distance_um, front_um = distance_um;
     if (two_point) {
         /* The manual's x is to the right, its y to the front; each axis has a distance of its own. */
-        const double flat = distance_um * cos_e - up * sin_e;
+        const double flat = distance_um * cos_e;
         right_um += near_correction_um(laser->distance_correction_um, laser->distance_x_um, NEAR_X_UM,
                                        fabs(flat * sin_a - left * cos_a));
         front_um += near_correction_um(laser->distance_correction_um, laser->distance_y_um, NEAR_Y_UM,
                                        fabs(flat * cos_a + left * sin_a));
     }
-    const double flat_right = right_um * cos_e - up * sin_e;
-    const double flat_front = front_um * cos_e - up * sin_e;
-    point->x_m = (float)((flat_front * cos_a + left * sin_a) * 1e-6);
-    point->y_m = (float)((left * cos_a - flat_right * sin_a) * 1e-6);
-    point->z_m = (float)((front_um * sin_e + up * cos_e) * 1e-6);
+    point->x_m = (float)((front_um * cos_e * cos_a + left * sin_a) * 1e-6);
+    point->y_m = (float)((left * cos_a - right_um * cos_e * sin_a) * 1e-6);
+    point->z_m = (float)((front_um * sin_e + laser->vertical_offset_um) * 1e-6);
 }
 
 uint32_t upb_firing_points(const upb_packet_calibration *calibration, const upb_firing *firing,
