@@ -3,7 +3,7 @@
 
 #include "packet_wire.h"
 
-#define FAR_UM 25040000.0 /* where distance_correction_um holds, and the two near places (HDL-64E manual) */
+#define FAR_UM 25040000.0 /* from where distance_correction_um holds; the two near places (HDL-64E manual) */
 #define NEAR_X_UM 2400000.0
 #define NEAR_Y_UM 1930000.0
 
@@ -21,15 +21,16 @@ static double near_correction_um(double far_um, double near_um, double near_at_u
     return (far_um - near_um) * (along_um - near_at_um) / (FAR_UM - near_at_um) + near_um - far_um;
 }
 
-/* The origin lies `up` over the sensor's and `left` of the direction: a shift, whatever the elevation. */
-static void place_point(const upb_laser *laser, int two_point, double distance_um, upb_point *point) {
+/* The origin lies `up` over the sensor's and `left` of the direction: a shift, whatever the elevation. The manual's x
+ * is to the right, its y to the front; near the sensor each axis has a distance of its own, and the height their mean.
+ */
+static void place_point(const upb_laser *laser, int near, double distance_um, upb_point *point) {
     const double azimuth = point->azimuth_mdeg * radians_per_mdeg;
     const double elevation = laser->elevation_mdeg * radians_per_mdeg;
     const double sin_a = sin(azimuth), cos_a = cos(azimuth), sin_e = sin(elevation), cos_e = cos(elevation);
     const double left = laser->horizontal_offset_um;
     double right_um = distance_um, front_um = distance_um;
-    if (two_point) {
-        /* The manual's x is to the right, its y to the front; each axis has a distance of its own. */
+    if (near) {
         const double flat = distance_um * cos_e;
         right_um += near_correction_um(laser->distance_correction_um, laser->distance_x_um, NEAR_X_UM,
                                        fabs(flat * sin_a - left * cos_a));
@@ -38,7 +39,7 @@ static void place_point(const upb_laser *laser, int two_point, double distance_u
     }
     point->x_m = (float)((front_um * cos_e * cos_a + left * sin_a) * 1e-6);
     point->y_m = (float)((left * cos_a - right_um * cos_e * sin_a) * 1e-6);
-    point->z_m = (float)((front_um * sin_e + laser->vertical_offset_um) * 1e-6);
+    point->z_m = (float)(((front_um + right_um) / 2 * sin_e + laser->vertical_offset_um) * 1e-6);
 }
 
 uint32_t upb_firing_points(const upb_packet_calibration *calibration, const upb_firing *firing,
@@ -59,7 +60,8 @@ uint32_t upb_firing_points(const upb_packet_calibration *calibration, const upb_
         point->reserved = 0;
         point->azimuth_mdeg = laser_azimuth_mdeg(laser, firing);
         point->distance_um = (uint32_t)distance_um;
-        place_point(laser, calibration->two_point != 0, (double)distance_um, point);
+        const int near = calibration->two_point && (double)firing->distance[beam] * unit_um < FAR_UM;
+        place_point(laser, near, (double)distance_um, point);
     }
     return count;
 }
