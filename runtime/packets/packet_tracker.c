@@ -35,6 +35,10 @@ static int64_t round_div(int64_t value, int64_t divisor) {
     return value >= 0 ? (value + divisor / 2) / divisor : -((-value + divisor / 2) / divisor);
 }
 
+static int64_t within(int64_t value, int64_t low, int64_t high) {
+    return value < low ? low : value > high ? high : value;
+}
+
 /* How a firing lies to the last one. */
 typedef struct motion {
     int64_t turned_mdeg; /* azimuth, whole turns included */
@@ -50,13 +54,12 @@ static motion motion_between(const upb_azimuth_tracker *tracker, const upb_firin
     const int64_t expected = rate * elapsed_ns / NS_PER_S;
     const int64_t surprise = short_way(seen - expected);
     const int64_t tolerance = 2 * step + 100 + (expected >= 0 ? expected : -expected) / 8;
+    const int64_t most = (int64_t)UPB_TRACKER_LOST_NS / tracker->cycle_ns;
     motion m = {expected + surprise, round_div(elapsed_ns, tracker->cycle_ns), 0};
     if (rate > 0 && (surprise > tolerance || surprise < -tolerance)) {
         m.flags = UPB_STEP_TIME_JUMP;
         m.turned_mdeg = seen > 0 ? seen : seen + FULL;
-        m.firings = step > 0 ? round_div(m.turned_mdeg, step) : 1;
-        if (m.firings < 1)
-            m.firings = 1;
+        m.firings = step > 0 ? within(round_div(m.turned_mdeg, step), 1, most) : 1;
     }
     if (seen == 0 && m.firings > 0 && m.turned_mdeg == 0)
         m.flags |= UPB_STEP_STUCK;
