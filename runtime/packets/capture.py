@@ -145,7 +145,9 @@ class PacketReader:
         store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         definition = f"builtin_interfaces/Time stamp\nuint8[{_DATA_BYTES}] data"
         types = typesys.get_types_from_msg(definition, _PACKET_TYPE)
-        types.update(typesys.get_types_from_msg("std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets", SCAN_TYPE))
+        types.update(
+            typesys.get_types_from_msg("std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets", SCAN_TYPE)
+        )
         store.register(types)
         return store.deserialize_cdr
 
@@ -174,7 +176,7 @@ class PcapWriter:
     ) -> None:
         self._source, self._destination = _ip(source), _ip(destination)
         self._identification = 0
-        self._file: BinaryIO = Path(path).open("wb")
+        self._file: BinaryIO = Path(path).open("wb")  # noqa: SIM115  closed by close()
         self._file.write(self._HEADER.pack(self._NANOSECONDS, 2, 4, 0, 0, _MAX_RECORD, 1))
 
     def write(self, payload: bytes, time_ns: int, port: int = DATA_PORT) -> None:
@@ -212,7 +214,9 @@ class PcapWriter:
 
 def _nanoseconds(stamp: Any) -> int:
     """Of a record's time: seconds, as a Decimal in files of nanoseconds, else a float good for microseconds."""
-    return round(stamp * 1_000_000) * 1000 if isinstance(stamp, float) else int(stamp * 1_000_000_000)
+    if isinstance(stamp, float):
+        return round(stamp * 1_000_000) * 1000
+    return int(stamp * 1_000_000_000)
 
 
 def _ip(text: str) -> bytes:

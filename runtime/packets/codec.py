@@ -205,8 +205,8 @@ class Decoder:
     """Packets of one sensor to firings.
 
     ``sensor``: a name, or ``auto`` for the first good packet's. ``pick``: of dual returns the primary is by beam the
-    brighter one (``strongest``) or the block of ``last`` returns. ``keep_calibration``: an HDL-64E's own record does not
-    replace the table.
+    brighter one (``strongest``) or the block of ``last`` returns. ``keep_calibration``: an HDL-64E's own record does
+    not replace the table.
     """
 
     def __init__(
@@ -413,8 +413,8 @@ class AzimuthTracker:
 
     def track(self, firings: Firings) -> Steps:
         """The next firings' places; of primary ones only."""
-        arrays = (firings.time_ns, firings.azimuth_mdeg, firings.rate_mdeg_s)
-        return Steps(*self._tracker.track(*(np.ascontiguousarray(a) for a in arrays)))
+        time_ns, azimuth_mdeg, rate_mdeg_s = firings._arrays()[:3]
+        return Steps(*self._tracker.track(time_ns, azimuth_mdeg, rate_mdeg_s))
 
     @property
     def turn_firings(self) -> int:
