@@ -214,9 +214,8 @@ class PcapWriter:
 
 def _nanoseconds(stamp: Any) -> int:
     """Of a record's time: seconds, as a Decimal in files of nanoseconds, else a float good for microseconds."""
-    if isinstance(stamp, float):
-        return round(stamp * 1_000_000) * 1000
-    return int(stamp * 1_000_000_000)
+    whole: int = round(stamp * 1_000_000) * 1000 if isinstance(stamp, float) else int(stamp * 1_000_000_000)
+    return whole
 
 
 def _ip(text: str) -> bytes:

@@ -4,7 +4,8 @@
 #include "packet_record.h"
 #include "packet_wire.h"
 
-#define JUMP_CDEG 500       /* from azimuth place to azimuth place: six times what any sensor turns */
+#define JUMP_CDEG 500 /* from azimuth place to azimuth place: six times what any sensor turns */
+#define SMOOTH_PACKETS 16
 #define NS_PER_S 1000000000 /* exact in 64 bits times the mdeg of a packet */
 
 upb_packet_decoder_config upb_packet_decoder_config_default(void) {
@@ -70,6 +71,14 @@ static uint32_t rate_of(const upb_packet_decoder *decoder, const uint8_t *packet
     if (turned <= 0)
         return 0;
     return (uint32_t)((int64_t)turned * 10 * NS_PER_S / ((int64_t)steps * slot_ns));
+}
+
+/* Over some packets: a packet's own, of azimuths in steps of 0.01 degrees, is half a percent off. */
+static uint32_t smoothed(upb_packet_decoder *decoder, uint32_t rate_mdeg_s) {
+    const int64_t was = decoder->last_rate_mdeg_s;
+    const int64_t now = was == 0 ? rate_mdeg_s : was + ((int64_t)rate_mdeg_s - was) / SMOOTH_PACKETS;
+    decoder->last_rate_mdeg_s = (uint32_t)now;
+    return (uint32_t)now;
 }
 
 /* The sensor's clock begins anew every hour; packets may be swapped around that moment. */
@@ -142,6 +151,7 @@ typedef struct packet_motion {
     wire_layout layout;
     uint32_t cycle_ns;
     uint32_t rate_mdeg_s;
+    uint32_t smooth_rate_mdeg_s;
     uint64_t time_ns;
     uint8_t single_kind; /* upb_return_mode of a packet that is not dual */
 } packet_motion;
@@ -153,10 +163,10 @@ static uint64_t jumped_ns(const uint8_t *packet, const packet_motion *motion, ui
     const uint64_t slot_ns = (uint64_t)motion->cycle_ns * motion->layout.firings_per_block;
     if (!is_jump(wire_turn(before, here)))
         return 0;
-    if (motion->rate_mdeg_s == 0)
+    if (motion->smooth_rate_mdeg_s == 0)
         return 1; /* unknown, and yet a jump */
     const uint64_t turned_mdeg = 10 * ((here + WIRE_FULL_TURN_CDEG - before) % WIRE_FULL_TURN_CDEG);
-    const uint64_t took_ns = turned_mdeg * NS_PER_S / motion->rate_mdeg_s;
+    const uint64_t took_ns = turned_mdeg * NS_PER_S / motion->smooth_rate_mdeg_s;
     return took_ns > slot_ns ? took_ns - slot_ns : 1;
 }
 
@@ -210,7 +220,7 @@ static uint32_t read_firings(upb_packet_decoder *decoder, const uint8_t *packet,
     motion.rate_mdeg_s = rate_of(decoder, packet, &motion.layout, motion.cycle_ns * motion.layout.firings_per_block);
     motion.time_ns = unwrapped_ns(decoder, info->time_us);
     motion.single_kind = (uint8_t)info->return_mode;
-    decoder->last_rate_mdeg_s = motion.rate_mdeg_s;
+    motion.smooth_rate_mdeg_s = smoothed(decoder, motion.rate_mdeg_s);
     uint32_t count = 0;
     for (uint32_t slot = 0; slot < motion.layout.slots; slot++) {
         const uint32_t first = count;

@@ -5,8 +5,9 @@
 
 #define FULL ((int64_t)UPB_FULL_TURN_MDEG)
 #define NS_PER_S INT64_C(1000000000)
-#define RATE_SHIFT 8   /* fraction bits of the smoothed rate */
-#define RATE_SMOOTH 32 /* firings */
+#define RATE_SHIFT 8    /* fraction bits of the smoothed rate */
+#define RATE_SMOOTH 32  /* firings */
+#define EXACT_FIRINGS 8 /* azimuth, in steps of 0.01 degrees, and speed are good enough to count so many */
 
 upb_packet_status upb_azimuth_tracker_init(upb_azimuth_tracker *tracker, uint32_t cut_mdeg, uint32_t cycle_ns) {
     if (!tracker || cut_mdeg >= UPB_FULL_TURN_MDEG || cycle_ns == 0 || cycle_ns > 1000000)
@@ -35,6 +36,8 @@ static int64_t round_div(int64_t value, int64_t divisor) {
     return value >= 0 ? (value + divisor / 2) / divisor : -((-value + divisor / 2) / divisor);
 }
 
+static int64_t magnitude(int64_t value) { return value >= 0 ? value : -value; }
+
 static int64_t within(int64_t value, int64_t low, int64_t high) {
     return value < low ? low : value > high ? high : value;
 }
@@ -46,20 +49,29 @@ typedef struct motion {
     uint32_t flags;
 } motion;
 
-/* The clock counts firings, the azimuth says whether to believe it. */
+/* The clock tells another story than the azimuth, which is believed: a firing forward, at least. */
+static void believe_azimuth(motion *m, int64_t step, int64_t most) {
+    m->flags = UPB_STEP_TIME_JUMP;
+    m->firings = step > 0 ? within(round_div(m->turned_mdeg, step), 1, most) : 1;
+}
+
+/* The clock counts firings, the azimuth says whether to believe it: over a few firings to the number, else roughly. */
 static motion motion_between(const upb_azimuth_tracker *tracker, const upb_firing *firing, int64_t elapsed_ns) {
     const int64_t rate = rate_of(tracker);
     const int64_t step = rate * tracker->cycle_ns / NS_PER_S;
+    const int64_t most = (int64_t)UPB_TRACKER_LOST_NS / tracker->cycle_ns;
     const int64_t seen = short_way((int64_t)firing->azimuth_mdeg - tracker->azimuth_mdeg);
     const int64_t expected = rate * elapsed_ns / NS_PER_S;
     const int64_t surprise = short_way(seen - expected);
-    const int64_t tolerance = 2 * step + 100 + (expected >= 0 ? expected : -expected) / 8;
-    const int64_t most = (int64_t)UPB_TRACKER_LOST_NS / tracker->cycle_ns;
+    const int64_t tolerance = 2 * step + 100 + magnitude(expected) / 8;
     motion m = {expected + surprise, round_div(elapsed_ns, tracker->cycle_ns), 0};
-    if (rate > 0 && (surprise > tolerance || surprise < -tolerance)) {
-        m.flags = UPB_STEP_TIME_JUMP;
+    if (rate > 0 && magnitude(surprise) > tolerance) {
         m.turned_mdeg = seen > 0 ? seen : seen + FULL;
-        m.firings = step > 0 ? within(round_div(m.turned_mdeg, step), 1, most) : 1;
+        believe_azimuth(&m, step, most);
+    } else if (step > 0 && m.turned_mdeg == seen && seen <= EXACT_FIRINGS * step) {
+        const int64_t by_azimuth = round_div(seen, step);
+        if (by_azimuth >= 1 && by_azimuth != m.firings)
+            believe_azimuth(&m, step, most);
     }
     if (seen == 0 && m.firings > 0 && m.turned_mdeg == 0)
         m.flags |= UPB_STEP_STUCK;
