@@ -371,7 +371,7 @@ typedef enum upb_pps { UPB_PPS_ABSENT = 0, UPB_PPS_SYNCING = 1, UPB_PPS_LOCKED =
 
 #define UPB_NMEA_BYTES 128u
 
-/* Temperatures are the raw bytes of firmware since 2018 (0 before): docs/packets.md gives the volts behind them. */
+/* Temperatures are degrees Celsius, of firmware since 2018; 0 before. */
 typedef struct upb_position {
     uint32_t time_us; /* after the hour */
     upb_pps pps;

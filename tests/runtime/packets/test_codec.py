@@ -293,3 +293,14 @@ def test_real_turns(name: str, data_dir: Path, capsys: pytest.CaptureFixture[str
         print(f"\n{name}: {turns:.2f} turns, {low:.1f} to {high:.1f} rpm, {tracker.turn_firings} firings", end="")
     if jumps:  # the part left out, as a share of the turn
         assert 0.4 < steps.missing[jumped][1:].mean() / tracker.turn_firings < 0.6
+
+
+def test_real_position_packets(data_dir: Path) -> None:
+    capture = data_dir / "packets" / "velodyne_vlp16" / "sample_velodyne_vlp16_gps.pcap"
+    positions = [Position.decode(d.payload) for d in PacketReader(capture, port=8308)]
+    assert len(positions) == 57
+    assert {(p.pps, p.nmea_valid, p.thermal_shutdown) for p in positions} == {(2, True, 0)}
+    times = [p.time_us for p in positions]
+    assert times == sorted(times)
+    again = [Position.decode(p.encode()) for p in positions]
+    assert again == positions
