@@ -111,8 +111,11 @@ nb::tuple calibration_tuple(const upb_packet_calibration &c) {
 #define STATUS_FIELDS(X)                                                                                               \
     X(hour)                                                                                                            \
     X(minute)                                                                                                          \
-    X(second) X(day) X(month) X(year) X(gps) X(temperature_c) X(firmware) X(warnings) X(upper_threshold)               \
-        X(lower_threshold) X(humidity) X(returns) X(power_level) X(rpm) X(fov_min_cdeg) X(fov_max_cdeg) X(life_hours)
+    X(second)                                                                                                          \
+    X(day)                                                                                                             \
+    X(month)                                                                                                           \
+    X(year) X(gps) X(temperature_c) X(firmware) X(warnings) X(upper_threshold) X(lower_threshold) X(humidity)          \
+        X(returns) X(power_level) X(rpm) X(fov_min_cdeg) X(fov_max_cdeg) X(life_hours)
 #define STATUS_BYTES(X) X(calibrated) X(ip_source) X(ip_destination)
 
 nb::dict status_dict(const upb_hdl64e_status &s) {
@@ -420,8 +423,10 @@ nb::tuple read_record(const nb::bytes &record) {
 #define POSITION_FIELDS(X)                                                                                             \
     X(time_us)                                                                                                         \
     X(thermal_shutdown)                                                                                                \
-    X(temperature_top) X(temperature_bottom) X(temperature_at_shutdown) X(temperature_at_power_up) X(adc_temperature)  \
-        X(adc_temperature_change) X(adc_seconds) X(adc_reason) X(adc_flags)
+    X(temperature_top)                                                                                                 \
+    X(temperature_bottom)                                                                                              \
+    X(temperature_at_shutdown)                                                                                         \
+    X(temperature_at_power_up) X(adc_temperature) X(adc_temperature_change) X(adc_seconds) X(adc_reason) X(adc_flags)
 
 nb::dict decode_position(const nb::bytes &payload) {
     upb_position p;
