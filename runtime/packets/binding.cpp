@@ -108,15 +108,13 @@ nb::tuple calibration_tuple(const upb_packet_calibration &c) {
 
 // ----------------------------------------------------------------------------------------------------------- status
 
+// clang-format off
 #define STATUS_FIELDS(X)                                                                                               \
-    X(hour)                                                                                                            \
-    X(minute)                                                                                                          \
-    X(second)                                                                                                          \
-    X(day)                                                                                                             \
-    X(month)                                                                                                           \
-    X(year) X(gps) X(temperature_c) X(firmware) X(warnings) X(upper_threshold) X(lower_threshold) X(humidity)          \
-        X(returns) X(power_level) X(rpm) X(fov_min_cdeg) X(fov_max_cdeg) X(life_hours)
+    X(hour) X(minute) X(second) X(day) X(month) X(year) X(gps) X(temperature_c) X(firmware) X(warnings)                \
+    X(upper_threshold) X(lower_threshold) X(humidity) X(returns) X(power_level) X(rpm) X(fov_min_cdeg)                 \
+    X(fov_max_cdeg) X(life_hours)
 #define STATUS_BYTES(X) X(calibrated) X(ip_source) X(ip_destination)
+// clang-format on
 
 nb::dict status_dict(const upb_hdl64e_status &s) {
     nb::dict d;
@@ -420,13 +418,11 @@ nb::tuple read_record(const nb::bytes &record) {
     return nb::make_tuple(calibration_tuple(calibration), status_dict(status));
 }
 
+// clang-format off
 #define POSITION_FIELDS(X)                                                                                             \
-    X(time_us)                                                                                                         \
-    X(thermal_shutdown)                                                                                                \
-    X(temperature_top)                                                                                                 \
-    X(temperature_bottom)                                                                                              \
-    X(temperature_at_shutdown)                                                                                         \
+    X(time_us) X(thermal_shutdown) X(temperature_top) X(temperature_bottom) X(temperature_at_shutdown)                 \
     X(temperature_at_power_up) X(adc_temperature) X(adc_temperature_change) X(adc_seconds) X(adc_reason) X(adc_flags)
+// clang-format on
 
 nb::dict decode_position(const nb::bytes &payload) {
     upb_position p;

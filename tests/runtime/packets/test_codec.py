@@ -25,6 +25,7 @@ from upbeam.runtime.packets import (
     PacketError,
     PacketReader,
     Position,
+    Status,
     Steps,
     identify,
     read_calibration,
@@ -34,7 +35,6 @@ from upbeam.runtime.packets import (
     write_calibration,
     write_record,
 )
-from upbeam.runtime.packets.codec import Status
 from upbeam.runtime.packets.tables import HEADER, header_text
 
 CORPUS = Path(__file__).parent / "corpus"
