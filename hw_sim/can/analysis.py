@@ -9,7 +9,9 @@ it has (no FIFO queues), and without errors unless ``error_interval_ns`` says ho
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,14 +88,19 @@ def longest_length(frame: CanFrame) -> FrameLength:
 
     Found by going through every state that the stuffing (and for classic frames the CRC) can be in.
     """
-    return _extreme_length(frame, longest=True)
+    return _extreme_length(_blank(frame), longest=True)
 
 
 def shortest_length(frame: CanFrame) -> FrameLength:
     """As :func:`longest_length`: the shortest."""
-    return _extreme_length(frame, longest=False)
+    return _extreme_length(_blank(frame), longest=False)
 
 
+def _blank(frame: CanFrame) -> CanFrame:
+    return replace(frame, data=bytes(len(frame.data)))
+
+
+@lru_cache(maxsize=1024)
 def _extreme_length(frame: CanFrame, *, longest: bool) -> FrameLength:
     if frame.fd:
         return _extreme_fd(frame, longest=longest)
@@ -270,7 +277,7 @@ def response_times(
     longest frame of at least this priority again. :raises ValueError: two messages with the same identifier.
     """
     ordered = sorted(messages, key=lambda m: arbitration_key(m.frame))
-    for one, two in zip(ordered, ordered[1:], strict=False):
+    for one, two in pairwise(ordered):
         if arbitration_key(one.frame) == arbitration_key(two.frame):
             raise ValueError(f"{one.name} and {two.name} have the same identifier {one.frame.name}")
     times = [transmission_ns(m.frame, rates, exact=exact) for m in ordered]

@@ -172,11 +172,12 @@ class SimulatedBus:
     """A bus with nodes, moved on by :meth:`advance_to`. All times are integer ns of one virtual clock.
 
     ``nominal_bit_rate`` and ``data_bit_rate`` in bit/s; without a data bit rate FD frames with bit rate switch are
-    refused (``fd=False``: every FD frame). A bit time must be a whole number of ns. ``keep`` bounds the lists of
-    transmissions and events kept (None: all).
+    refused (``fd=False``: every FD frame). A bit time must be a whole number of ns.
     """
 
-    def __init__(self, nominal_bit_rate: int = 500_000, data_bit_rate: int | None = 2_000_000, *, fd: bool = True) -> None:
+    def __init__(
+        self, nominal_bit_rate: int = 500_000, data_bit_rate: int | None = 2_000_000, *, fd: bool = True
+    ) -> None:
         self.nominal_bit_ns = bit_time_ns(nominal_bit_rate)
         self.data_bit_ns = bit_time_ns(data_bit_rate or nominal_bit_rate)
         self.switches = data_bit_rate is not None and fd
@@ -276,6 +277,15 @@ class SimulatedBus:
     def advance(self, duration_ns: int) -> None:
         """As :meth:`advance_to`, from now."""
         self.advance_to(self.now_ns + duration_ns)
+
+    def advance_next(self, limit_ns: int) -> bool:
+        """Move on to the next thing that happens, at most to ``limit_ns``; False if nothing did before the limit."""
+        upcoming = self.next_event_ns()
+        if upcoming is None or upcoming > limit_ns:
+            self.advance_to(max(limit_ns, self.now_ns))
+            return False
+        self.advance_to(upcoming)
+        return True
 
     def next_event_ns(self) -> int | None:
         """When something happens next; None if never (nothing queued, planned or recovering)."""
@@ -400,9 +410,7 @@ class SimulatedBus:
         transmitters = [self.nodes[s.name] for s in stations if s.log.transmitted]
         self._release(start, free, ends[dominant] if dominant >= 0 else start, transmitters)
 
-    def _take_logs(
-        self, stations: list[Station], contenders: dict[str, _Queued], ends: list[int], start: int
-    ) -> None:
+    def _take_logs(self, stations: list[Station], contenders: dict[str, _Queued], ends: list[int], start: int) -> None:
         senders = {s.log.sent: s.name for s in stations if s.log.sent is not None}
         transmitting = [s.name for s in stations if s.wire is not None]
         for station in stations:
@@ -525,4 +533,3 @@ def bit_time_ns(bit_rate: int) -> int:
     if bit_rate <= 0 or NS_PER_S % bit_rate:
         raise ValueError(f"a bit at {bit_rate} bit/s does not take a whole number of nanoseconds")
     return NS_PER_S // bit_rate
-
