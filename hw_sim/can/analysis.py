@@ -25,6 +25,7 @@ from .bits import (
     STUFF_RUN,
     arbitration_key,
     crc_rule,
+    from_bits,
     header_bits,
     wire_bits,
 )
@@ -100,6 +101,21 @@ def _blank(frame: CanFrame) -> CanFrame:
     return replace(frame, data=bytes(len(frame.data)))
 
 
+def longest_payload(frame: CanFrame) -> bytes:
+    """A payload that makes a classic frame as long as :func:`longest_length` says.
+
+    :raises ValueError: a CAN FD frame.
+    """
+    if frame.fd:
+        raise ValueError(f"frame {frame.name}: only for classic frames")
+    header, _ = header_bits(frame)
+    states = _CrcStates(longest=True, keep=True)
+    for index in range(len(header) + 8 * len(frame.data)):
+        states.step((header[index],) if index < len(header) else (0, 1))
+    bits = states.best_path()[len(header) :]
+    return bytes(from_bits(bits[at : at + 8]) for at in range(0, len(bits), 8))
+
+
 @lru_cache(maxsize=1024)
 def _extreme_length(frame: CanFrame, *, longest: bool) -> FrameLength:
     if frame.fd:
@@ -117,8 +133,9 @@ def _extreme_length(frame: CanFrame, *, longest: bool) -> FrameLength:
 class _CrcStates:
     """Most (or fewest) stuff bits on the way to each state: CRC register, last bit, length of the run."""
 
-    def __init__(self, longest: bool) -> None:
+    def __init__(self, longest: bool, keep: bool = False) -> None:
         self._sign = 1 if longest else -1
+        self._kept: list[NDArray[np.int32]] | None = [] if keep else None
         # best[run - 1, last bit, register]; before the first bit: an endless run of nothing, register 0
         self._best: NDArray[np.int32] | None = None
 
@@ -132,6 +149,8 @@ class _CrcStates:
         for bit in bits:
             moved, target = self._place(bit), _crc_step(bit)
             after[:, bit, target] = self._better(after[:, bit, target], moved)
+        if self._kept is not None:
+            self._kept.append(self._best)
         self._best = after
 
     def _place(self, bit: int) -> NDArray[np.int32]:
@@ -154,8 +173,14 @@ class _CrcStates:
 
     def finish(self) -> int:
         """Send the CRC of every state; the most (fewest) stuff bits of all."""
+        _, counts = self._after_crc()
+        return int(counts.max() if self._sign > 0 else counts.min())
+
+    def _after_crc(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Every state that can be (run - 1, last bit, register), and its stuff bits once its CRC was sent."""
         assert self._best is not None
-        run, last, register = (index.astype(np.int32) for index in np.nonzero(self._best != _NEVER))
+        states = np.argwhere(self._best != _NEVER)
+        run, last, register = (states[:, axis].astype(np.int32) for axis in range(3))
         count = self._best[run, last, register]
         run = run + 1
         for shift in range(CRC15.width - 1, -1, -1):
@@ -166,8 +191,36 @@ class _CrcStates:
             run = np.where(full, 1, run)
             run = np.where(bit == last, run + 1, 1)
             last = bit
-        count = count + (run == STUFF_RUN)
-        return int(count.max() if self._sign > 0 else count.min())
+        return states, count + (run == STUFF_RUN)
+
+    def best_path(self) -> list[int]:
+        """Bits, first to last, that lead to the best end (needs ``keep``)."""
+        assert self._kept is not None
+        assert self._best is not None
+        states, counts = self._after_crc()
+        run, last, register = (int(i) for i in states[int(counts.argmax())])
+        here, bits = self._best, [last]
+        for before in reversed(self._kept):
+            value = int(here[run, last, register])
+            run, last, register = self._predecessor(before, run, last, register, value)
+            bits.append(last)
+            here = before
+        return bits[::-1]
+
+    @staticmethod
+    def _predecessor(before: NDArray[np.int32], run: int, bit: int, register: int, value: int) -> tuple[int, int, int]:
+        """A state from which ``bit`` leads to the state given with ``value`` stuff bits."""
+        odd = register & 1  # the generator is odd: it was added if, and only if, the register is
+        old = (register ^ (CRC15.polynomial if odd else 0)) >> 1 | (bit ^ odd) << (CRC15.width - 1)
+        for old_run in range(STUFF_RUN):
+            for old_last in (0, 1):
+                full = old_run == STUFF_RUN - 1
+                level = 1 - old_last if full else old_last
+                new_run = (1 if full else old_run + 1) if bit == level else 0
+                cost = before[old_run, old_last, old]
+                if new_run == run and cost != _NEVER and cost + full == value:
+                    return old_run, old_last, old
+        raise AssertionError("no way back: the tables disagree")
 
 
 def _crc_step(bit: int) -> NDArray[np.int64]:

@@ -38,17 +38,13 @@ class CanFrame:
         if self.fd and self.remote:
             raise ValueError(f"identifier {self.identifier:#x}: CAN FD has no remote frames")
         if self.fd and len(self.data) not in FD_LENGTHS:
-            raise ValueError(
-                f"identifier {self.identifier:#x}: {len(self.data)} bytes is no CAN FD length {FD_LENGTHS}"
-            )
+            raise ValueError(f"identifier {self.identifier:#x}: no CAN FD frame has {len(self.data)} bytes")
         if not self.fd and len(self.data) > CLASSIC_MAX_BYTES:
             raise ValueError(f"identifier {self.identifier:#x}: {len(self.data)} bytes, a classic frame holds 8")
         if not self.fd and (self.bit_rate_switch or self.error_state_indicator):
             raise ValueError(f"identifier {self.identifier:#x}: bit rate switch and ESI belong to CAN FD")
         if self.remote and (self.data or not 0 <= self.remote_length <= CLASSIC_MAX_BYTES):
-            raise ValueError(
-                f"identifier {self.identifier:#x}: a remote frame carries no data and asks for 0 to 8 bytes"
-            )
+            raise ValueError(f"identifier {self.identifier:#x}: a remote frame has no data, it asks for 0 to 8 bytes")
 
     @property
     def length_code(self) -> int:

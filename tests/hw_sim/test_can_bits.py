@@ -76,18 +76,22 @@ def test_crc_is_the_remainder_of_the_standards_polynomials(bits: list[int]) -> N
         assert rule.of(bits) == divide(bits, sum(1 << p for p in powers), rule.width, rule.start)
 
 
-@pytest.mark.parametrize(
-    ("frame", "bits"),
-    [
-        (CanFrame(0x555, bytes([0x55] * 8)), 111),  # 34 + 64 + 13, nothing to stuff in head and payload
-        (CanFrame(0, remote=True), 53),
-    ],
-)
-def test_length_of_known_frames(frame: CanFrame, bits: int) -> None:
-    stuffed = len(wire_bits(frame).stuff_positions)
-    unstuffed = length_of(frame).bits - stuffed
-    assert unstuffed == (54 if frame.extended else 34) + 8 * len(frame.data) + 13
-    assert abs(length_of(frame).bits - bits) <= 1
+@pytest.mark.parametrize(("size", "bits"), [(0, 47), (1, 55), (4, 79), (8, 111)])
+def test_length_without_stuffing_is_that_of_the_standard(size: int, bits: int) -> None:
+    """SOF, identifier, RTR, IDE, r0, DLC, payload, CRC and delimiters, end of frame, intermission; 20 more extended."""
+    for extended in (False, True):
+        frame = CanFrame(0x555, bytes([0x55] * size), extended)
+        assert length_of(frame).bits - len(wire_bits(frame).stuff_positions) == bits + 20 * extended
+
+
+def test_a_frame_written_out_by_hand() -> None:
+    """Identifier 0x014, one byte 0x01: stuff bits after the first five zeros, after r0 and within the payload."""
+    frame = CanFrame(0x014, b"\x01")
+    plain = [int(bit) for bit in "000000010100000000100000001"]
+    crc = divide(plain, 0xC599, 15, 0)
+    head = "000001001010000010001000001001"
+    tail = f"{crc:015b}"  # 111011101010011: nothing to stuff
+    assert "".join(map(str, wire_bits(frame).bits)) == head + tail + "1111111111"
 
 
 @pytest.mark.parametrize(("size", "standard", "extended"), [(0, 55, 80), (1, 65, 90), (4, 95, 120), (8, 135, 160)])
