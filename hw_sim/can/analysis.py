@@ -35,7 +35,6 @@ TRAILER_BITS = 3 + EOF_BITS + INTERMISSION_BITS
 """CRC delimiter, ACK slot, ACK delimiter, end of frame, intermission."""
 ERROR_FRAME_BITS = 31
 """Longest error signalling: 6 + 6 flag bits, 8 delimiter, 3 intermission and 8 of suspension (Davis 2007 takes 31)."""
-_NEVER = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,67 +130,63 @@ def _extreme_length(frame: CanFrame, *, longest: bool) -> FrameLength:
 
 
 class _CrcStates:
-    """Most (or fewest) stuff bits on the way to each state: CRC register, last bit, length of the run."""
+    """Most (or fewest) stuff bits on the way to each state: CRC register, last bit, length of the run.
+
+    Kept as int8, negated where the fewest are looked for, so that the greater value is the better one; a state that
+    cannot be has a value below ``_NEVER`` whatever stuff bits were added to it.
+    """
+
+    _NEVER = -64
+    _UNREACHED = -100
 
     def __init__(self, longest: bool, keep: bool = False) -> None:
-        self._sign = 1 if longest else -1
-        self._kept: list[NDArray[np.int32]] | None = [] if keep else None
-        # best[run - 1, last bit, register]; before the first bit: an endless run of nothing, register 0
-        self._best: NDArray[np.int32] | None = None
+        self._step = np.int8(1 if longest else -1)
+        self._kept: list[NDArray[np.int8]] | None = [] if keep else None
+        self._best: NDArray[np.int8] | None = None  # [run - 1, last bit, register]
 
     def step(self, bits: tuple[int, ...]) -> None:
         """One more bit, any of ``bits``."""
+        after = np.full((STUFF_RUN, 2, 1 << CRC15.width), self._UNREACHED, np.int8)
         if self._best is None:
-            self._best = np.full((STUFF_RUN, 2, 1 << CRC15.width), _NEVER, np.int32)
-            self._best[0, bits[0], CRC15.step(0, bits[0])] = 0
-            return
-        after = np.full_like(self._best, _NEVER)
-        for bit in bits:
-            moved, target = self._place(bit), _crc_step(bit)
-            after[:, bit, target] = self._better(after[:, bit, target], moved)
-        if self._kept is not None:
-            self._kept.append(self._best)
+            after[0, bits[0], CRC15.step(0, bits[0])] = 0
+        else:
+            for bit in bits:
+                after[:, bit, :] = self._move(self._best, bit)[:, _crc_before(bit)]
+            if self._kept is not None:
+                self._kept.append(self._best)
         self._best = after
 
-    def _place(self, bit: int) -> NDArray[np.int32]:
-        """Stuff bits by new run length and old register, when ``bit`` comes next."""
-        best = self._best
-        assert best is not None
-        moved = np.full((STUFF_RUN, best.shape[2]), _NEVER, np.int32)
-        for run in range(1, STUFF_RUN):  # going on, or turning round
-            moved[run] = self._better(moved[run], best[run - 1, bit])
-            moved[0] = self._better(moved[0], best[run - 1, 1 - bit])
-        full = best[STUFF_RUN - 1]  # five equal: a stuff bit of the other value stands between
-        moved[0] = self._better(moved[0], np.where(full[bit] == _NEVER, _NEVER, full[bit] + 1))
-        moved[1] = self._better(moved[1], np.where(full[1 - bit] == _NEVER, _NEVER, full[1 - bit] + 1))
+    def _move(self, best: NDArray[np.int8], bit: int) -> NDArray[np.int8]:
+        """Values by new run length and old register, when ``bit`` comes next."""
+        moved = np.empty((STUFF_RUN, best.shape[2]), np.int8)
+        stuffed = best[STUFF_RUN - 1] + self._step  # five equal: a stuff bit of the other value stands between
+        moved[0] = np.maximum(best[: STUFF_RUN - 1, 1 - bit].max(axis=0), stuffed[bit])
+        moved[1] = np.maximum(best[0, bit], stuffed[1 - bit])
+        moved[2:] = best[1 : STUFF_RUN - 1, bit]
         return moved
-
-    def _better(self, a: NDArray[np.int32], b: NDArray[np.int32]) -> NDArray[np.int32]:
-        if self._sign > 0:
-            return np.maximum(a, b)
-        return np.where(a == _NEVER, b, np.where(b == _NEVER, a, np.minimum(a, b)))
 
     def finish(self) -> int:
         """Send the CRC of every state; the most (fewest) stuff bits of all."""
         _, counts = self._after_crc()
-        return int(counts.max() if self._sign > 0 else counts.min())
+        return int(self._step) * int(counts.max())
 
     def _after_crc(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Every state that can be (run - 1, last bit, register), and its stuff bits once its CRC was sent."""
+        """Every state that can be (run - 1, last bit, register), and its value once its CRC was sent."""
         assert self._best is not None
-        states = np.argwhere(self._best != _NEVER)
+        states = np.argwhere(self._best > self._NEVER)
         run, last, register = (states[:, axis].astype(np.int32) for axis in range(3))
-        count = self._best[run, last, register]
+        step = np.int32(self._step)
+        count = self._best[run, last, register].astype(np.int32)
         run = run + 1
         for shift in range(CRC15.width - 1, -1, -1):
             bit = register >> shift & 1
             full = run == STUFF_RUN
-            count = count + full
+            count = count + full * step
             last = np.where(full, 1 - last, last)
             run = np.where(full, 1, run)
             run = np.where(bit == last, run + 1, 1)
             last = bit
-        return states, count + (run == STUFF_RUN)
+        return states, count + (run == STUFF_RUN) * step
 
     def best_path(self) -> list[int]:
         """Bits, first to last, that lead to the best end (needs ``keep``)."""
@@ -208,27 +203,25 @@ class _CrcStates:
         return bits[::-1]
 
     @staticmethod
-    def _predecessor(before: NDArray[np.int32], run: int, bit: int, register: int, value: int) -> tuple[int, int, int]:
+    def _predecessor(before: NDArray[np.int8], run: int, bit: int, register: int, value: int) -> tuple[int, int, int]:
         """A state from which ``bit`` leads to the state given with ``value`` stuff bits."""
-        odd = register & 1  # the generator is odd: it was added if, and only if, the register is
-        old = (register ^ (CRC15.polynomial if odd else 0)) >> 1 | (bit ^ odd) << (CRC15.width - 1)
+        old = int(_crc_before(bit)[register])
         for old_run in range(STUFF_RUN):
             for old_last in (0, 1):
                 full = old_run == STUFF_RUN - 1
                 level = 1 - old_last if full else old_last
                 new_run = (1 if full else old_run + 1) if bit == level else 0
-                cost = before[old_run, old_last, old]
-                if new_run == run and cost != _NEVER and cost + full == value:
+                if new_run == run and int(before[old_run, old_last, old]) + full == value:
                     return old_run, old_last, old
         raise AssertionError("no way back: the tables disagree")
 
 
-def _crc_step(bit: int) -> NDArray[np.int64]:
-    """The register that follows each register when ``bit`` is shifted in."""
+@lru_cache(maxsize=2)
+def _crc_before(bit: int) -> NDArray[np.int64]:
+    """The register before each register, had ``bit`` been shifted in; the generator is odd, so there is one."""
     register = np.arange(1 << CRC15.width)
-    moved = (register << 1) & ((1 << CRC15.width) - 1)
-    top = (register >> (CRC15.width - 1)) ^ bit
-    return np.where(top == 1, moved ^ CRC15.polynomial, moved)
+    odd = register & 1
+    return (register ^ odd * CRC15.polynomial) >> 1 | (bit ^ odd) << (CRC15.width - 1)
 
 
 def _extreme_fd(frame: CanFrame, *, longest: bool) -> FrameLength:
