@@ -123,6 +123,7 @@ class Commander:
         assert response is not None
         self._sender = Sender(command)
         self._receiver = Receiver(response)
+        self._last_response = b""
 
     @property
     def freshness(self) -> int:
@@ -175,12 +176,18 @@ class Commander:
         return self.build(Command.CLEAR_FAULTS, argument=fault)
 
     def response(self, frame: CanFrame) -> Response | None:
-        """The answer in a frame; None if it is none, or its E2E check says that it is damaged or a repetition."""
+        """The answer in a frame; None if it is none, damaged, or the very frame that came before.
+
+        A device that was reset counts from 0 again, so a repeated counter alone does not make a repetition.
+        """
         message = database.load().get_message_by_name("UPB_Response")
         if frame.identifier != message.frame_id or frame.extended:
             return None
-        if self._receiver.check(frame.data) in (E2EStatus.WRONG_CRC, E2EStatus.REPEATED):
+        verdict = self._receiver.check(frame.data)
+        is_repetition = verdict is E2EStatus.REPEATED and frame.data == self._last_response
+        if verdict is E2EStatus.WRONG_CRC or is_repetition:
             return None
+        self._last_response = frame.data
         values = database.signals_of(message, frame.data)
         expected = mac_of(self.key, self._receiver.profile.config.data_id, frame.data)
         return Response(

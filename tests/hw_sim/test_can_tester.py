@@ -252,7 +252,10 @@ def test_responses_are_read_and_their_mac_judged() -> None:
     other = commander.response(response_frame(bytes(16), 1, result="MAC"))
     assert other is not None
     assert (other.result, other.authentic) == ("MAC", False)
-    assert commander.response(response_frame(KEY, 1)) is None  # the same counter again
+    assert commander.response(response_frame(bytes(16), 1, result="MAC")) is None  # the same frame again
+    assert commander.response(response_frame(KEY, 1)) is not None  # another with that counter: after a reset
+    damaged = response_frame(KEY, 2)
+    assert commander.response(CanFrame(0x301, damaged.data[:-1] + b"!", fd=True, bit_rate_switch=True)) is None
     assert commander.response(CanFrame(0x210, bytes(8))) is None
 
 
