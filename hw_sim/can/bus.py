@@ -171,6 +171,10 @@ class BusFaults:
 class SimulatedBus:
     """A bus with nodes, moved on by :meth:`advance_to`. All times are integer ns of one virtual clock.
 
+    ``transmissions`` and ``events`` hold what has happened so far, in order of time, and ``listeners`` and
+    ``event_listeners`` are called as it happens; ``errors`` counts errors by kind as each node saw them. What becomes
+    of a frame is settled when it begins: error counters and states of nodes change then, up to one frame early.
+
     ``nominal_bit_rate`` and ``data_bit_rate`` in bit/s; without a data bit rate FD frames with bit rate switch are
     refused (``fd=False``: every FD frame). A bit time must be a whole number of ns.
     """
@@ -188,7 +192,7 @@ class SimulatedBus:
         self.events: list[BusEvent] = []
         self.errors: Counter[ErrorKind] = Counter()
         self.error_frames = 0
-        self.listeners: list[Callable[[Received], None]] = []
+        self.listeners: list[Callable[[Transmission], None]] = []
         self.event_listeners: list[Callable[[BusEvent], None]] = []
         self._faults = BusFaults()
         self._heap: list[tuple[int, int, Callable[[], None]]] = []
@@ -292,6 +296,12 @@ class SimulatedBus:
         recovery = self._next_recovery()
         times = [self._heap[0][0] if self._heap else None, self._next_start(), recovery[0] if recovery else None]
         return min((t for t in times if t is not None), default=None)
+
+    def log(self) -> list[str]:
+        """Everything that happened, a line each: time in ms, node, frame or event."""
+        lines = [(t.end_ns, f"{t.sender:<12} {_text(t)}") for t in self.transmissions]
+        lines += [(e.time_ns, f"{e.node:<12} {e.what}: {e.detail}") for e in self.events]
+        return [f"{time_ns / 1e6:12.6f} {line}" for time_ns, line in sorted(lines, key=lambda item: item[0])]
 
     def load(self, start_ns: int, end_ns: int) -> float:
         """Share of the time from start to end that the bus was taken: frames, error frames, intermissions."""
@@ -428,9 +438,15 @@ class SimulatedBus:
 
     def _finish_sent(self, node: Node, queued: _Queued, start: int, end: int) -> None:
         node._queue.remove(queued)
-        node.sent += 1
         sent = Transmission(queued.frame, node.name, queued.queued_ns, start, end, max(1, queued.attempts))
-        self.transmissions.append(sent)
+
+        def record() -> None:
+            node.sent += 1
+            self.transmissions.append(sent)
+            for listener in self.listeners:
+                listener(sent)
+
+        self.call_at(end, record)
 
     def _deliver(self, node: Node, frame: CanFrame, sender: str, time_ns: int) -> None:
         received = Received(time_ns, frame, sender)
@@ -455,9 +471,13 @@ class SimulatedBus:
 
     def _note(self, time_ns: int, node: str, what: Literal["error", "state", "refused"], detail: str) -> None:
         event = BusEvent(time_ns, node, what, detail)
-        self.events.append(event)
-        for listener in self.event_listeners:
-            listener(event)
+
+        def record() -> None:
+            self.events.append(event)
+            for listener in self.event_listeners:
+                listener(event)
+
+        self.call_at(time_ns, record)
 
     def _note_states(self, before: dict[str, ErrorState], time_ns: int) -> None:
         for name, old in before.items():
@@ -526,6 +546,13 @@ class _BusDisturbance:
     def seen(self, index: int, station: str, level: int) -> int:
         """What one node samples."""
         return level ^ ((index, station) in self._local)
+
+
+def _text(sent: Transmission) -> str:
+    frame = sent.frame
+    kind = ("FD " if frame.fd else "") + ("BRS " if frame.bit_rate_switch else "") + ("remote " if frame.remote else "")
+    repeated = f" (attempt {sent.attempts})" if sent.attempts > 1 else ""
+    return f"{frame.name} {kind}[{len(frame.data)}] {frame.data.hex(' ')}{repeated}"
 
 
 def bit_time_ns(bit_rate: int) -> int:

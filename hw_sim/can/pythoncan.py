@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import can
+from can.interfaces.udp_multicast import UdpMulticastBus
 
 from .bus import NS_PER_S, Node, Received, SimulatedBus
 from .frame import CanFrame
@@ -167,15 +168,22 @@ class UdpInterface(can.BusABC):
 class Bridge:
     """Passes frames between two python-can buses, both ways, whenever :meth:`pump` is called.
 
-    Frames that the other side cannot carry are counted in ``dropped``. Buses must not echo their own frames
-    (``virtual`` and ``udp_multicast`` do not unless asked to).
+    Frames that the other side cannot carry are counted in ``dropped``. python-can's ``udp_multicast`` gives a sender
+    its own frames back: such an echo is recognised by its content, dropped and counted in ``echoes``. (Should an
+    echo get lost, an equal frame from somebody else is taken for it, once.)
     """
+
+    ECHOES_AWAITED = 256
 
     def __init__(self, one: can.BusABC, other: can.BusABC) -> None:
         self.one = one
         self.other = other
         self.passed = 0
         self.dropped = 0
+        self.echoes = 0
+        self._awaited: dict[int, deque[CanFrame]] = {
+            id(bus): deque(maxlen=self.ECHOES_AWAITED) for bus in (one, other) if isinstance(bus, UdpMulticastBus)
+        }
 
     def pump(self, timeout: float = 0.0) -> int:
         """Pass on what is waiting, waiting up to ``timeout`` seconds for the first frame; how many were passed."""
@@ -190,10 +198,24 @@ class Bridge:
         if message is None:
             return False
         try:
+            frame = from_message(message)
+            if self._is_echo(source, frame):
+                return True
             target.send(message)
-            self.passed += 1
         except (can.CanError, ValueError):
             self.dropped += 1
+            return True
+        self.passed += 1
+        if id(target) in self._awaited:
+            self._awaited[id(target)].append(frame)
+        return True
+
+    def _is_echo(self, source: can.BusABC, frame: CanFrame) -> bool:
+        awaited = self._awaited.get(id(source), deque())
+        if frame not in awaited:
+            return False
+        awaited.remove(frame)
+        self.echoes += 1
         return True
 
 

@@ -63,7 +63,7 @@ def test_shortcut_and_bit_by_bit_agree(seed: int) -> None:
     for index, frame in enumerate(frames):
         bus.node(f"n{index}").send(frame)
     bus.node("listener")
-    bus.advance_to(1)
+    bus.advance_to(5 * MS)
     first = bus.transmissions[0]
     stations = [Station(f"n{i}", ErrorCounters(), f) for i, f in enumerate(frames)]
     stations.append(Station("listener", ErrorCounters()))
@@ -329,6 +329,27 @@ def test_an_error_passive_fd_node_says_so() -> None:
     a.send(CanFrame(5, bytes(8), fd=True))
     bus.advance_to(5 * MS)
     assert b.received[0].frame.error_state_indicator
+
+
+def test_what_happened_is_told_in_order_and_not_before_it_happened() -> None:
+    bus = SimulatedBus()
+    a, _ = bus.node("a"), bus.node("b")
+    told: list[tuple[int, int]] = []
+    bus.listeners.append(lambda sent: told.append((bus.now_ns, sent.end_ns)))
+    bus.event_listeners.append(lambda event: told.append((bus.now_ns, event.time_ns)))
+    bus.flip_bit(30)
+    a.send(CanFrame(0x100, b"\x01\x02"))
+    a.send(CanFrame(0x18DAF110, b"", extended=True))
+    bus.advance_to(100_000)
+    assert not bus.transmissions
+    bus.advance_to(10 * MS)
+    assert len(told) == 2 + len(bus.events)
+    assert all(now == then for now, then in told)
+    log = bus.log()
+    assert len(log) == len(told)
+    assert "error: bit error as transmitter" in log[0]
+    assert "100 [2] 01 02 (attempt 2)" in log[-2]
+    assert "18DAF110 [0]" in log[-1]
 
 
 def test_wrong_use_is_refused_by_name() -> None:

@@ -353,6 +353,37 @@ def test_a_bridge_joins_datagrams_and_python_cans_virtual_bus() -> None:
             bus.shutdown()
 
 
+def test_a_bridge_to_udp_multicast_neither_loses_nor_echoes() -> None:
+    """Frames of the daemon's datagrams for CAN tools in other processes, and their frames back."""
+    channel = {"interface": "udp_multicast", "channel": "239.74.163.2", "port": 43_118}
+    try:
+        inside, tool = can.Bus(**channel), can.Bus(**channel)  # type: ignore[arg-type]
+    except (OSError, can.CanError) as error:
+        pytest.skip(f"no multicast on this machine: {error}")
+    device, desk = UdpInterface(), UdpInterface()
+    device.peer, desk.peer = desk.address, device.address
+    bridge = Bridge(desk, inside)
+    try:
+        frames = [frame for frame in some_frames(4, 10) if not frame.error_state_indicator]
+        for frame in frames:
+            device.send(to_message(frame))
+            assert bridge.pump(5.0) == 1
+            message = tool.recv(5.0)
+            assert message is not None
+            assert from_message(message) == frame
+        sent_back = CanFrame(0x300, b"tool")
+        tool.send(to_message(sent_back))
+        for _ in range(200):
+            bridge.pump(0.02)
+            if bridge.passed == len(frames) + 1:
+                break
+        assert [from_message(m) for m in drain(device)] == [sent_back]
+        assert (bridge.passed, bridge.echoes, bridge.dropped) == (len(frames) + 1, len(frames), 0)
+    finally:
+        for bus in (device, desk, inside, tool):
+            bus.shutdown()
+
+
 @pytest.mark.parametrize("suffix", [".blf", ".asc"])
 def test_a_transcript_reads_back_with_virtual_times(tmp_path: Path, suffix: str) -> None:
     bus = SimulatedBus()
