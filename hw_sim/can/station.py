@@ -181,17 +181,25 @@ class Station:
         self._replay.append(DOMINANT)
 
     def _guard(self, action: Bits) -> Bits:
-        """Run an action; after an error its flag and delimiter, in any case the intermission."""
-        try:
-            yield from action
-        except WireError as error:
-            yield from self._error_frame(error)
+        """Run an action, then the intermission; after an error in either its flag and delimiter, and intermission."""
+        while True:
+            try:
+                yield from action
+                return
+            except WireError as error:
+                yield from self._error_frame(error)
+                action = self._after_error()
+
+    def _after_error(self) -> Bits:
         self._transmitting, self.sending_at = False, None
         yield from self._intermission()
 
     def _attempt(self, wire: WireBits) -> Bits:
         if not (yield from self._transmit(wire)):
             yield from self._receive()
+            return
+        self._transmitting, self.sending_at = False, None
+        yield from self._intermission()
 
     def _transmit(self, wire: WireBits) -> Generator[int, int, bool]:
         """Send; False if arbitration was lost, the bits seen so far then stand in the replay."""
@@ -235,6 +243,7 @@ class Station:
         self.counters.received()
         if (yield RECESSIVE) == DOMINANT:  # too late to refuse the frame: overload
             yield from self._flag_and_delimiter()
+        yield from self._intermission()
 
     def _expect_recessive(self) -> Bits:
         if (yield from self._take()) == DOMINANT:

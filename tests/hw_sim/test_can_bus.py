@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import subprocess
+import sys
 from itertools import pairwise
 
 import pytest
@@ -276,7 +278,7 @@ def test_same_identifier_from_two_nodes_ends_in_errors() -> None:
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, 1000), st.sampled_from([1e-4, 1e-3, 5e-3]))
+@given(st.integers(0, 1000), st.sampled_from([1e-4, 1e-3, 5e-3, 2e-2]))
 def test_under_noise_every_frame_arrives_once_or_the_node_is_off(seed: int, rate: float) -> None:
     """Frames are never altered; only an error in the very last bits may repeat one."""
     bus = SimulatedBus()
@@ -293,6 +295,23 @@ def test_under_noise_every_frame_arrives_once_or_the_node_is_off(seed: int, rate
     assert len(bus.transmissions) == len(sent)
     assert sum(t.attempts - 1 for t in bus.transmissions) == bus.error_frames
     assert len(got) - len(sent) <= bus.error_frames
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32), st.sampled_from([1e-2, 5e-2, 0.3]))
+def test_no_noise_however_bad_stops_the_simulation(seed: int, rate: float) -> None:
+    """Frames of three nodes under noise that breaks flags and delimiters too; afterwards all of them get through."""
+    rng = random.Random(seed)
+    bus = SimulatedBus()
+    nodes = [bus.node(n, capacity=100) for n in "abc"]
+    bus.set_bit_error_rate(rate, seed=seed)
+    for _ in range(20):
+        rng.choice(nodes).send(random_frame(rng), rng.randrange(10 * MS))
+    bus.advance_to(15 * MS)
+    bus.set_bit_error_rate(0)
+    bus.advance_to(100 * MS)
+    assert len(bus.transmissions) == 20
+    assert all(node.state is not ErrorState.BUS_OFF for node in nodes)
 
 
 def test_equal_seeds_give_equal_runs() -> None:
@@ -368,3 +387,14 @@ def test_wrong_use_is_refused_by_name() -> None:
         bus.node("a")
     with pytest.raises(ValueError, match="whole number"):
         bit_time_ns(83_333)
+
+
+def test_the_bus_and_its_analysis_need_no_extra() -> None:
+    program = (
+        "import sys\n"
+        "for name in ('can', 'cantools', 'isotp', 'udsoncan', 'cryptography', 'serial', 'cobs'):\n"
+        "    sys.modules[name] = None\n"
+        "from upbeam.hw_sim.can import SimulatedBus, response_times, Receiver, encode_frame\n"
+        "SimulatedBus().advance_to(1)\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import socket
 import threading
@@ -355,7 +356,7 @@ def test_a_bridge_joins_datagrams_and_python_cans_virtual_bus() -> None:
 
 def test_a_bridge_to_udp_multicast_neither_loses_nor_echoes() -> None:
     """Frames of the daemon's datagrams for CAN tools in other processes, and their frames back."""
-    channel = {"interface": "udp_multicast", "channel": "239.74.163.2", "port": 43_118}
+    channel = {"interface": "udp_multicast", "channel": "239.74.163.2", "port": 20_000 + os.getpid() % 20_000}
     try:
         inside, tool = can.Bus(**channel), can.Bus(**channel)  # type: ignore[arg-type]
     except (OSError, can.CanError) as error:
