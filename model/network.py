@@ -172,7 +172,9 @@ class WindowNetwork:
 
 
 def _with_minimum(windows: ArrayLike) -> FloatArray:
-    x = np.asarray(windows, dtype=np.float64)
+    x = np.asarray(windows)
+    if x.dtype != object:  # numbers of another kind, as those that count operations, go through as they are
+        x = x.astype(np.float64)
     if x.shape[-1:] != (WINDOW,):
         raise NetworkError(f"windows have shape {list(x.shape)}, expected [..., {WINDOW}]")
     return np.concatenate([x, x.min(axis=-1, keepdims=True)], axis=-1)

@@ -63,7 +63,7 @@ def _operations(model: Model) -> dict[str, Any]:
         f"{x['graph']} {x['name']}": f"{x['macs_per_window']} MACs, {x['parameters']} parameters"
         for x in counts.pop("layers")
     }
-    return {**counts, **layers}
+    return {k: v for k, v in counts.items() if not isinstance(v, (dict, list))} | layers
 
 
 def _memory(model: Model, result: LiveResult) -> dict[str, Any]:
