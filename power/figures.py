@@ -44,8 +44,9 @@ UNITS: dict[str, tuple[str, float]] = {
 }
 """Each unit's dimension and its size in that dimension's base unit."""
 
-KINDS = ("data sheet", "measured", "simulated", "modelled", "assumption", "none")
-"""``measured`` may be followed by `` by NAME`` or `` here``; ``none``: there is no figure, and the source says why."""
+KINDS = ("data sheet", "measured", "simulated", "modelled", "assumption", "given", "none")
+"""``measured`` may be followed by `` by NAME`` or `` here``; ``given``: by the user; ``none``: there is no figure, and
+the source says why."""
 
 
 class FigureError(ValueError):

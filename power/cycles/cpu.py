@@ -8,10 +8,10 @@ A column is ``blocks`` vectors of windows. For each block
            + the block code's own chain, in int8
 
 ``cycles of a pair`` is the scarcest resource of the loop: multiply-adds or loads. What a core does in a cycle is
-measured by micro-benchmarks (loops of independent instructions); two numbers, the efficiency of the loop and the exposed
-cycles, come from the AVX2 float kernel at two widths. Nothing is fitted on the kernels that are predicted: AVX-512,
-integers, other widths. Where nothing can be run, pair cycles are those of a static analysis (docs/performance.md) and
-the rest is an assumption, with an interval that says so.
+measured by micro-benchmarks (loops of independent instructions); two numbers, the efficiency of the loop and the
+exposed cycles, come from the AVX2 float kernel at two widths. Nothing is fitted on the kernels that are predicted:
+AVX-512, integers, other widths. Where nothing can be run, pair cycles are those of a static analysis
+(docs/performance.md) and the rest is an assumption, with an interval that says so.
 """
 
 from __future__ import annotations

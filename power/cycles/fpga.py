@@ -97,9 +97,9 @@ class FpgaCore:
 
 
 def smallest_core(multipliers: int, hidden: int, share: float = 0.8) -> FpgaCore:
-    """One lane, both networks, with the least ``fold`` whose multipliers fit in ``share`` of those there are. Raises
-    FpgaCoreError where not even one multiplier is free for each network."""
-    usable = int(multipliers * share)
+    """One lane, both networks, with the least ``fold`` whose multipliers fit in ``share`` of those there are, or in the
+    eight of the smallest parts. Raises FpgaCoreError where not even one multiplier is free for each network."""
+    usable = max(min(multipliers, 8), int(multipliers * share))
     for fold in range(1, TAPS * hidden + 1):
         core = FpgaCore(1, fold, hidden)
         if core.multipliers <= usable:
