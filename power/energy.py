@@ -4,8 +4,8 @@
 
 ``static`` is each device's own; ``dynamic``, the energy of a multiply-accumulate, is shared by the devices of a family
 and scaled with the feature size. The shared slope is the pooled one within devices (analysis of covariance), at
-least 0. Latency from multiply-accumulates alone is the device's (or its family's) geometric mean rate, or its share of peak:
-architecture decides it, so its error is large, and is printed.
+least 0. Latency from multiply-accumulates alone is the device's (or its family's) geometric mean rate, or its share of
+peak: architecture decides it, so its error is large, and is printed.
 
 Everything is judged by leaving each row out and predicting it from the others, as a factor (1 is perfect), beside the
 constant: this device always draws what its other rows drew.

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["RaplDomain", "read_rails", "rapl_domains", "rapl_energy_j"]
+__all__ = ["RaplDomain", "rapl_domains", "rapl_energy_j", "read_rails"]
 
 _NOT_CONNECTED = "NC"
 _CHANNELS = 3
@@ -27,7 +27,7 @@ def _number(path: Path) -> float | None:
 
 
 def read_rails(root: Path = Path("/")) -> dict[str, float]:
-    """Power of each rail, W, by name; empty without a sensor. Rails not connected, or that cannot be read, are absent."""
+    """Power of each rail, W, by name; empty without a sensor. Rails not connected or not readable are absent."""
     rails = dict(_hwmon_rails(root))
     return rails or dict(_iio_rails(root))
 
@@ -68,7 +68,7 @@ class RaplDomain:
 
 
 def rapl_domains(root: Path = Path("/")) -> list[RaplDomain]:
-    """The packages, or ``psys`` alone where there is one: never a total with its parts. Empty where none can be read."""
+    """The packages, or ``psys`` alone where there is one: never a total with its parts. Empty if none can be read."""
     found = []
     for folder in sorted(root.glob("sys/class/powercap/intel-rapl:*")):
         if folder.name.count(":") != 1:

@@ -1,7 +1,7 @@
 """What ``tegrastats`` prints, of JetPack 4, 5 and 6: rails, loads, clocks, temperatures. Newer tokens are passed over.
 
-Rails stand as ``NAME now/mean`` in mW (JetPack 4) or ``NAME 1234mW/1200mW`` (5 and later). Only ``now`` is used: what the
-tool calls the mean has no stated window.
+Rails stand as ``NAME now/mean`` in mW (JetPack 4) or ``NAME 1234mW/1200mW`` (5 and later). Only ``now`` is used: what
+the tool calls the mean has no stated window.
 """
 
 from __future__ import annotations

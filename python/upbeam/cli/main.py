@@ -10,7 +10,21 @@ import typer
 import upbeam
 from upbeam.kernels.opencl import OpenClError
 
-from . import bench, doctor, evaluate, export, inspect, ops, quantize, simulate, stream, train, upsample, verify
+from . import (
+    bench,
+    doctor,
+    estimate,
+    evaluate,
+    export,
+    inspect,
+    ops,
+    quantize,
+    simulate,
+    stream,
+    train,
+    upsample,
+    verify,
+)
 from .common import message
 
 __all__ = ["app", "run"]
@@ -33,6 +47,7 @@ app.command("verify")(verify.verify)
 app.command("export")(export.export)
 app.command("inspect")(inspect.inspect)
 app.command("bench")(bench.bench)
+app.command("estimate")(estimate.estimate)
 app.command("doctor")(doctor.doctor)
 
 

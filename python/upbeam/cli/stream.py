@@ -14,10 +14,13 @@ from upbeam.model.beams import beam_table, beam_table_names
 from upbeam.model.frames import image_of_cloud, kitti_files
 from upbeam.model.io import read_cloud
 from upbeam.model.rules import BEAMS, ROWS
+from upbeam.power.catalogue import device as find_device
+from upbeam.power.deploy import SERVICES, Service, target_service
 from upbeam.runtime.live import LiveConfig, LiveProgress, LiveResult, firing_columns, run_live
 from upbeam.runtime.upsampler import CPUS, PRECISIONS, Model, load_model
 
 from .common import JsonOption, UserError, emit_json, message, progress_bar, show, table
+from .estimate import load_of
 from .sources import simulated_scans
 
 __all__ = ["stream"]
@@ -56,6 +59,11 @@ def stream(
     deadline_ms: Annotated[float, typer.Option(help="From the last input column to the last output column.")] = 50.0,
     clock: Annotated[str, typer.Option(help="real, or virtual (deterministic, modelled service time).")] = "real",
     column_us: Annotated[float, typer.Option(help="Virtual clock: service time of a column.")] = VIRTUAL_COLUMN_US,
+    target: Annotated[
+        str | None, typer.Option(help="Virtual clock: service time and jitter of a device (upbeam estimate).")
+    ] = None,
+    mode: Annotated[str | None, typer.Option(help="With --target: its power mode.")] = None,
+    service: Annotated[str, typer.Option(help=f"With --target: {', '.join(SERVICES)} of its interval.")] = "central",
     sensor: Annotated[
         str | None, typer.Option(help=f"Simulated sensor ({', '.join(beam_table_names())}); the model's if omitted.")
     ] = None,
@@ -74,14 +82,25 @@ def stream(
         raise UserError(f"--backend {backend}: a stream runs on the cpu; whole images also on others (upsample)")
     if clock not in ("real", "virtual"):
         raise UserError(f"--clock {clock}: expected real or virtual")
+    if (target is not None and clock != "virtual") or (target is None and (mode is not None or service != "central")):
+        raise UserError("--target goes with --clock virtual, --mode and --service with --target")
     loaded = load_model(model)
     config = LiveConfig(
         rate_hz=rate, frames=frames, deadline_ms=deadline_ms, clock="real" if clock == "real" else "virtual", cpu=cpu,
         precision=precision, any_sensor=any_sensor, service_column_us=column_us if clock == "virtual" else None,
     )  # fmt: skip
+    deployed = None
+    if target is not None:
+        load = load_of(loaded, precision, None, rate, deadline_ms)
+        deployed = target_service(
+            find_device(target), load, config.columns_per_packet, mode=mode, service=service, seed=seed
+        )
+        config = replace(config, service_column_us=None, service_us=deployed.service_us)
     feed = _feed(source, loaded, sensor, any_sensor, frames, rate, seed, quiet=as_json)
     result = _play(feed, loaded, config, quiet=as_json)
     summary = _summary(feed, loaded, result)
+    if deployed is not None:
+        summary["target"] = _on_target(deployed, result)
     if report is not None:
         from .stream_report import write_stream_report
 
@@ -192,6 +211,16 @@ def _summary(feed: _Feed, model: Model, result: LiveResult) -> dict[str, Any]:
     }
 
 
+def _on_target(service: Service, result: LiveResult) -> dict[str, Any]:
+    """What a deployment has to know besides the ledger: the margin, and how many sensors fit."""
+    worst = result.latency_ms.get("max")
+    return {
+        **service.as_dict(),
+        "margin_ms": None if worst is None else result.deadline_ms - worst,
+        "sensors": service.sensors(result.rate_hz, result.columns, result.columns_per_packet),
+    }
+
+
 def _print(summary: dict[str, Any], result: LiveResult) -> None:
     kind = summary["kind"]
     latency = result.latency_ms
@@ -218,10 +247,24 @@ def _print(summary: dict[str, Any], result: LiveResult) -> None:
             rows,
         )
     )
+    if "target" in summary:
+        _print_target(summary["target"], result)
     if "report" in summary:
         message(f"report: {summary['report']}")
     if result.stopped:
         message("stopped early")
+
+
+def _print_target(target: dict[str, Any], result: LiveResult) -> None:
+    column, wakeup, sensors = target["column_us"], target["wakeup_us"], target["sensors"]
+    margin = "unknown" if target["margin_ms"] is None else f"{target['margin_ms']:.3f} ms"
+    where = f"{target['device']}{', mode ' + target['mode'] if target['mode'] else ''}"
+    show(
+        f"On {where} (modelled): a column takes {column['value']:.3g} us ({column['low']:.3g} to {column['high']:.3g}; "
+        f"{target['service']} used), waking up {wakeup['value']:.3g} us ({wakeup['low']:.3g} to {wakeup['high']:.3g}).\n"
+        f"Least margin to {result.deadline_ms:g} ms: {margin}. Sensors that fit on {target['cores']} cores: "
+        f"{sensors['value']} ({sensors['low']} to {sensors['high']})."
+    )
 
 
 def _pair(values: dict[str, float], unit: str) -> str:
