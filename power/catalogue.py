@@ -212,7 +212,7 @@ class _Reader:
         for section, key, value in self._entries():
             if section not in _SECTIONS:
                 known = ", ".join((*filter(None, _SECTIONS), "modes.NAME"))
-                raise self._error(section, "", f"section [{section}] is unknown, expected one of: {known}")
+                raise self._error(section, "", f"is unknown, expected one of: {known}")
             kind = _SECTIONS[section].get(key)
             if kind is None:
                 raise self._error(section, key, f"is unknown, expected one of: {', '.join(_SECTIONS[section])}")
@@ -232,7 +232,7 @@ class _Reader:
                 yield "", name, value
             else:
                 if not value:
-                    raise self._error(name, "", f"section [{name}] is empty")
+                    raise self._error(name, "", "is empty")
                 for key, inner in value.items():
                     yield name, key, inner
 

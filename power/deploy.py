@@ -36,19 +36,12 @@ class Service:
     cores: int
     seed: int
 
-    def sensors(self, rate_hz: float, columns: int, packet_columns: int) -> dict[str, int]:
-        """Sensors of this rate that fit on all cores, each core no longer busy than a turn lasts; wake-ups included."""
-        packets = -(-columns // packet_columns)
+    def sensors(self, rate_hz: float, columns: int) -> dict[str, int]:
+        """Sensors of this rate that fit on all cores, each core no longer busy computing than a turn lasts. Waking up
+        delays a packet, but occupies no core."""
         turn_us = 1e6 / rate_hz
-        busy = {
-            name: columns * self.column_us.span("us")[k] + packets * self.wakeup_us.span("us")[k]
-            for k, name in enumerate(("value", "low", "high"))
-        }
-        return {
-            "value": int(turn_us / busy["value"]) * self.cores,
-            "low": int(turn_us / busy["high"]) * self.cores,
-            "high": int(turn_us / busy["low"]) * self.cores,
-        }
+        value, low, high = (int(turn_us / (columns * us)) * self.cores for us in self.column_us.span("us"))
+        return {"value": value, "low": high, "high": low}
 
     def as_dict(self) -> dict[str, Any]:
         return {

@@ -108,12 +108,18 @@ class EnergyModel:
     """family -> energy of a multiply-accumulate at the reference node"""
     static_w: dict[str, float]
     """device -> static power"""
+    own_dynamic_j: dict[str, float]
+    """device -> the same of its own, where its user measured it at two rates"""
+
+    def dynamic_of(self, like: Row) -> float:
+        """Of the device of ``like``, or its family; 0 where neither was measured."""
+        return self.own_dynamic_j.get(like.device, self.dynamic_j.get(like.family, 0.0))
 
     def power_w(self, like: Row) -> float:
         """Of the device and family of ``like`` at its rate. Raises CatalogueError without a row of the device."""
         if like.device not in self.static_w:
             raise CatalogueError(f"{like.device}: no measured row")
-        return self.static_w[like.device] + self.dynamic_j[like.family] * like.scaled_rate
+        return self.static_w[like.device] + self.dynamic_of(like) * like.scaled_rate
 
     def rate(self, like: Row) -> float:
         """Multiply-accumulates a second that the device reaches, from its other workloads: geometric mean; of its
@@ -149,11 +155,14 @@ def peak_share(rows: Sequence[Row]) -> Figure:
 def fit(rows: Sequence[Row]) -> EnergyModel:
     """Static power of each device, dynamic energy of each family."""
     dynamic = {family: _slope([r for r in rows if r.family == family]) for family in _in_order(r.family for r in rows)}
-    static = {}
+    static, own_dynamic = {}, {}
     for device in _in_order(row.device for row in rows):
         own = [row for row in rows if row.device == device]
-        static[device] = max(0.0, _mean([row.power_w - dynamic[row.family] * row.scaled_rate for row in own]))
-    return EnergyModel(tuple(rows), dynamic, static)
+        if all(row.by_user for row in own) and len({row.rate for row in own}) > 1:
+            own_dynamic[device] = _slope(own)
+        slope = own_dynamic.get(device, dynamic[own[0].family])
+        static[device] = max(0.0, _mean([row.power_w - slope * row.scaled_rate for row in own]))
+    return EnergyModel(tuple(rows), dynamic, static, own_dynamic)
 
 
 def _slope(rows: Sequence[Row]) -> float:

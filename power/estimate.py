@@ -245,8 +245,11 @@ def _working_power(device: Device, row: Row, known: Knowledge, errors: Errors) -
     if row.device in known.model.static_w:
         factor = max(energy.LEAST_FACTOR, errors.power or 0.0)
         source = f"static and dynamic power fitted on measured rows; leave-one-out of {errors.of}: factor {factor:.3g}"
+        if row.device in known.model.own_dynamic_j:
+            factor = energy.LEAST_FACTOR
+            source = f"static and dynamic power of the user's own rows, which it meets; factor {factor:.3g} assumed"
         return Figure.within(known.model.power_w(row), factor, "W", "modelled", source)
-    dynamic = known.model.dynamic_j.get(row.family, 0.0) * row.scaled_rate
+    dynamic = known.model.dynamic_of(row) * row.scaled_rate
     idle, low, high = device.figure("power.idle").span("W")
     source = f"no measured row: idle power ({device.figure('power.idle').source}) and the family's dynamic energy"
     return Figure(idle + dynamic, low + dynamic / _UNMEASURED_DYNAMIC, high + dynamic * _UNMEASURED_DYNAMIC, "W",
@@ -436,7 +439,7 @@ def _dominates(device: Device, row: Row, known: Knowledge) -> str:
     static = known.model.static_w.get(device.name)
     if static is None:
         static = device.figure("power.idle").get("W")
-    dynamic = known.model.dynamic_j.get(row.family, 0.0) * row.scaled_rate
+    dynamic = known.model.dynamic_of(row) * row.scaled_rate
     share = static / (static + dynamic)
     parts = f"{100 * share:.1f} % of the power while computing; multiply-accumulates: {100 - 100 * share:.1f} %"
     return f"static power: {parts}"

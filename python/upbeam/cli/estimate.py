@@ -171,7 +171,7 @@ def _sentences(one: Estimate) -> list[str]:
         lines.append("Memory: " + ", ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in one.memory.items()) + ".")
     lines += [f"What dominates: {one.dominates}.", _error_line(one)]
     for name, bounded in (("Latency", one.latency_ms), ("Power", one.power_w)):
-        boundary = f" [{bounded.boundary}]" if bounded.figure.known else ""
+        boundary = f", {bounded.boundary}" if bounded.figure.known else ""
         lines.append(f"{name}{boundary}: {bounded.figure.source}.")
     return [*lines, *one.notes]
 
@@ -257,8 +257,8 @@ def _overview(found: Sequence[Estimate], load: Load) -> Any:
 def _interval(bounded: Bounded, unit: str) -> str:
     if not bounded.figure.known:
         return "-"
-    value, low, high = (_short(x) for x in bounded.figure.span(unit))
-    return f"{value} ({low}..{high})"
+    value, low, high = bounded.figure.span(unit)
+    return f"{_short(value)} ({low:.2g}..{high:.2g})"
 
 
 def _list_devices(as_json: bool) -> None:

@@ -217,7 +217,7 @@ def _on_target(service: Service, result: LiveResult) -> dict[str, Any]:
     return {
         **service.as_dict(),
         "margin_ms": None if worst is None else result.deadline_ms - worst,
-        "sensors": service.sensors(result.rate_hz, result.columns, result.columns_per_packet),
+        "sensors": service.sensors(result.rate_hz, result.columns),
     }
 
 
@@ -261,7 +261,8 @@ def _print_target(target: dict[str, Any], result: LiveResult) -> None:
     where = f"{target['device']}{', mode ' + target['mode'] if target['mode'] else ''}"
     show(
         f"On {where} (modelled): a column takes {column['value']:.3g} us ({column['low']:.3g} to {column['high']:.3g}; "
-        f"{target['service']} used), waking up {wakeup['value']:.3g} us ({wakeup['low']:.3g} to {wakeup['high']:.3g}).\n"
+        f"{target['service']} used),\n"
+        f"waking up {wakeup['value']:.3g} us ({wakeup['low']:.3g} to {wakeup['high']:.3g}).\n"
         f"Least margin to {result.deadline_ms:g} ms: {margin}. Sensors that fit on {target['cores']} cores: "
         f"{sensors['value']} ({sensors['low']} to {sensors['high']})."
     )

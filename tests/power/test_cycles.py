@@ -1,0 +1,178 @@
+"""Latency models: operation counts against the code that runs them, prediction against a recorded run, properties."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from upbeam.power.bench import _native
+from upbeam.power.catalogue import cpu_core
+from upbeam.power.cycles.cpu import cpu_time
+from upbeam.power.cycles.fpga import FpgaCore, FpgaCoreError, smallest_core
+from upbeam.power.cycles.gpu import gpu_latency, window_work
+from upbeam.power.cycles.host import HostRun, core_of, predictions, worst_error
+from upbeam.power.cycles.kernel_ops import ISAS, kernel_ops
+from upbeam.power.figures import Figure
+from upbeam.power.ops import count_operations
+
+RUN = Path(__file__).parent / "baselines" / "cpu_kernels.json"
+GOAL = 0.20
+
+
+@pytest.fixture(scope="module")
+def run():
+    return HostRun.from_dict(json.loads(RUN.read_text())["run"])
+
+
+def test_counts_are_those_of_the_loops_that_run_them():
+    """Every instruction set this machine has; on others than x86 there are no such loops."""
+    for mix in _native.mixes():
+        ops = kernel_ops(mix["isa"], mix["precision"])
+        for part in ("pair", "leaky", "rest"):
+            counted = {k: v for k, v in mix[part].items() if v}
+            assert {k: v for k, v in getattr(ops, part).items() if v} == counted, (mix["isa"], mix["precision"], part)
+    print(f"{len(_native.mixes())} kernels compared")
+
+
+def test_a_recorded_run_is_predicted_within_20_percent(run):
+    """Calibrated on plain C and AVX2 float at two widths; AVX-512, integers and other widths are predicted."""
+    found = predictions(run)
+    assert {case.isa for case, _ in found} >= {"avx2", "avx512", "avx512-vnni"}
+    assert {case.precision for case, _ in found} == {"fp32", "int16", "int8"}
+    assert len({case.hidden for case, _ in found}) >= 5
+    case, error = worst_error(run)
+    print(f"worst of {len(found)}: {case.isa} {case.precision} {case.work}, {case.hidden} units: {100 * error:+.1f} %")
+    for case, ns in found:
+        assert abs(ns / case.ns - 1) <= GOAL, case
+
+
+def test_the_calibration_sees_only_what_it_may(run):
+    """Times of every other kernel can be anything: the core stays the same."""
+    others = [c for c in run.cases if not c.is_calibration]
+    assert all(c.isa not in ("scalar", "avx2") or c.precision != "fp32" or c.hidden not in (4, 24) or c.work == "push"
+               for c in others)  # fmt: skip
+    wild = tuple(replace(c, ns=c.ns if c.is_calibration else 9 * c.ns) for c in run.cases)
+    assert core_of(replace(run, cases=wild)) == core_of(run)
+
+
+CORES = ("cortex-a57", "carmel", "cortex-a78ae")
+ISA_OF = {"cortex-a57": "neon", "carmel": "neon", "cortex-a78ae": "neon-dot"}
+PRECISION = st.sampled_from(("fp32", "int16", "int8"))
+
+
+@given(st.sampled_from(CORES), PRECISION, st.integers(1, 32), st.floats(0.1, 6.0), st.floats(1.0, 4.0))
+def test_a_faster_clock_never_raises_latency(name, precision, pairs, clock, faster):
+    core = cpu_core(name)
+    slow, fast = (cpu_time(core, ISA_OF[name], precision, (pairs, 0), c) for c in (clock, clock * faster))
+    for a, b in ((slow.kernels, fast.kernels), (slow.push, fast.push)):
+        assert all(y <= x * (1 + 1e-12) for x, y in zip(a.span("ns"), b.span("ns"), strict=True))
+        assert a.low <= a.value <= a.high
+
+
+@given(st.sampled_from(CORES), PRECISION, st.integers(0, 31), st.integers(0, 31), st.integers(0, 8))
+def test_more_units_never_take_less(name, precision, plain, leaky, more):
+    core = cpu_core(name)
+
+    def of(a, b):
+        return cpu_time(core, ISA_OF[name], precision, (a, b), 1.5).kernels.value
+
+    assert of(plain + more, leaky) >= of(plain, leaky)
+    assert of(plain, leaky + more) >= of(plain, leaky)
+    assert of(plain, leaky + 1) >= of(plain + 1, leaky)
+
+
+def test_the_pair_cycles_of_docs_performance():
+    """12 units, both networks: 58 cycles a window for the loops alone on the Cortex-A57 model, float."""
+    core = replace(cpu_core("cortex-a57"), mixed_per_cycle=1e12, exposed_cycles=0.0)
+    cycles = cpu_time(core, "neon", "fp32", (12, 0), 1.0).kernels.value
+    assert cycles / 32 == pytest.approx(58, rel=0.01)
+
+
+def test_unknown_instruction_sets_and_precisions():
+    with pytest.raises(ValueError, match="no operation counts for 'sse'"):
+        kernel_ops("sse", "fp32")
+    with pytest.raises(ValueError, match="precision 'fp16'"):
+        kernel_ops("avx2", "fp16")
+    assert all(isa.blocks * isa.windows == 32 for isa in ISAS.values())
+
+
+# ------------------------------------------------------------------------------------------------------------- FPGA
+
+
+def schedule(core, columns):
+    """The schedule clock by clock: one beat enters per clock; a column's windows start when the next column is in and
+    the lanes are free."""
+    free = done = 0
+    for column in range(columns):
+        last_beat = 32 * (column + 2)  # of the column after it, were nothing ever late
+        start = max(last_beat, free)
+        free = start + -(-31 // core.lanes) * core.window_cycles
+        done = free + core.pipeline
+    return done
+
+
+@given(st.integers(1, 31), st.integers(1, 96), st.booleans(), st.integers(1, 300))
+def test_frame_cycles_are_at_least_the_schedules(lanes, fold, shared, columns):
+    core = FpgaCore(lanes, fold, shared=shared)
+    exact = schedule(core, columns)
+    assert core.column_cycles == max(32, -(-31 // lanes) * core.window_cycles)
+    # The closed form waits for no more than two columns longer than the schedule.
+    assert exact - 2 * core.column_cycles <= core.frame_cycles(columns) <= exact + 2 * core.column_cycles
+
+
+def test_one_window_per_clock():
+    """Both networks side by side: one input beat per clock decides."""
+    assert FpgaCore(1, 1).frame_cycles(2048) <= 65_536 * 1.01 + 200
+    assert FpgaCore(1, 1).multipliers == 192
+    assert FpgaCore(1, 12).multipliers == 16
+
+
+@given(st.integers(2, 2000), st.integers(1, 32))
+def test_the_smallest_core_fits_and_no_smaller_fold_does(multipliers, hidden):
+    core = smallest_core(multipliers, hidden)
+    usable = max(min(multipliers, 8), int(multipliers * 0.8))
+    assert core.multipliers <= usable
+    assert core.fold == 1 or FpgaCore(1, core.fold - 1, hidden).multipliers > usable
+
+
+def test_impossible_cores():
+    for bad in ({"lanes": 0}, {"lanes": 32}, {"fold": 0}, {"fold": 97}, {"hidden": 0}, {"pipeline": 0}):
+        with pytest.raises(FpgaCoreError):
+            FpgaCore(**bad)
+    with pytest.raises(FpgaCoreError, match="at least 2"):
+        smallest_core(1, 12)
+    with pytest.raises(FpgaCoreError, match="columns 0"):
+        FpgaCore().frame_cycles(0)
+
+
+@given(st.floats(1, 500), st.floats(1, 5), st.integers(1, 31), st.integers(1, 96))
+def test_fpga_latency_falls_with_the_clock(mhz, faster, lanes, fold):
+    core = FpgaCore(lanes, fold)
+    slow, fast = (core.latency(Figure.within(f, 1.2, "MHz", "assumption", "x"), 100) for f in (mhz, mhz * faster))
+    assert slow.low <= slow.value <= slow.high
+    assert fast.value <= slow.value * (1 + 1e-12)
+
+
+# -------------------------------------------------------------------------------------------------------------- GPU
+
+
+@given(st.floats(1e9, 1e15), st.floats(1e9, 1e12), st.floats(1.0, 10.0), st.integers(1, 32))
+def test_gpu_latency_holds_its_value_and_falls_with_the_peak(peak, bandwidth, faster, hidden):
+    work = window_work(count_operations((8, 2, hidden)))
+    share = Figure(0.11, 0.09, 0.13, "1", "modelled", "x")
+    launch = Figure(10.0, 4.0, 30.0, "us", "assumption", "x")
+
+    def at(macs, byte_rate):
+        return gpu_latency(work, Figure.exact(macs, "MAC/s", "data sheet", "x"), share,
+                           Figure.exact(byte_rate, "B/s", "data sheet", "x"), launch)  # fmt: skip
+
+    base = at(peak, bandwidth)
+    assert base.low <= base.value <= base.high
+    assert at(peak * faster, bandwidth).value <= base.value
+    assert at(peak, bandwidth * faster).value <= base.value
+    assert base.low >= 2 * 0.004
