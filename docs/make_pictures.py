@@ -1,8 +1,8 @@
 """Makes the pictures of README.md and docs/accuracy.md.
 
 ``.venv/bin/python docs/make_pictures.py`` draws them all: range images and a cloud of simulated frames, and the Pareto
-front from the measured figures in ``docs/pareto.csv``. ``--measured FILE.json ...`` first takes these figures anew from
-what ``upbeam evaluate --json`` printed; ``docs/pareto.csv`` begins with the commands.
+front from the measured figures in ``power/measurements/pareto.csv``. ``--measured FILE.json ...`` first takes these
+figures anew from what ``upbeam evaluate --json`` printed; ``power/measurements/pareto.csv`` begins with the commands.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from upbeam.model.geometry import to_metres, to_points
 from upbeam.power.report import Panel, plot_close_up, plot_range_images
 
 FOLDER = Path(__file__).with_name("images")
-FIGURES = Path(__file__).with_name("pareto.csv")
+FIGURES = Path(__file__).parents[1] / "power" / "measurements" / "pareto.csv"
 SEED = 11
 SIMPLE = ("valid-mean", "edge-aware")
 """Methods without a network, drawn at 0 multiply-adds."""

@@ -105,11 +105,14 @@ class Knowledge:
         return [row for row in self.model.rows if row.device == device]
 
     def errors(self, device: Device) -> Errors:
-        """Of the device's own rows where two or more tell, else of its family's."""
+        """Of the device's own rows where two or more tell, of its family's where it has one. A device without any row
+        borrows the family's error of latency alone: nothing tells how far off its power is."""
         own = [x for x in self.results if x.row.device == device.name]
         family = _FAMILY_OF_ROWS.get(device.family, "")
         chosen, of = (own, "its own rows") if len(own) > 1 else (self._of_family(family), f"rows of {family or 'none'}")
         worst = {what: max((f for x in chosen if (f := x.factor(what))), default=None) for what in _WHATS}
+        if not own:
+            return Errors(None, worst["latency"], None, 0, "no row of its own", dict.fromkeys(_WHATS))
         skill = {what: energy.skill(chosen, what) for what in _WHATS}
         return Errors(worst["power"], worst["latency"], worst["energy"], len(chosen), of, skill)
 

@@ -54,7 +54,7 @@ def test_figures_of_other_frames_are_refused(pictures, tmp_path):
 
 
 def test_the_committed_figures_are_drawn(pictures, tmp_path):
-    points = pictures.read_points(DOCS / "pareto.csv")
+    points = pictures.read_points(pictures.FIGURES)
     assert {"valid-mean", "edge-aware", "hidden-4", "hidden-6", "paper-ring"} <= {p.method for p in points}
     for point in points:
         assert point.chamfer_low <= point.chamfer <= point.chamfer_high

@@ -179,7 +179,12 @@ def _sentences(one: Estimate) -> list[str]:
 def _error_line(one: Estimate) -> str:
     e = one.errors
     if e.rows == 0:
-        return "Leave-one-out error: no measured row to judge by."
+        more = (
+            ""
+            if e.latency_from_macs is None
+            else (f"; latency from MACs alone: {_number(e.latency_from_macs)} on other devices of its family")
+        )
+        return f"Leave-one-out error: no measured row of this device to judge by{more}."
     skill = ", ".join(f"{k} {_number(v)}" for k, v in e.skill.items())
     return (
         f"Leave-one-out over {e.rows} rows ({e.of}), worst factor: power, and energy with the latency given, "
