@@ -98,6 +98,7 @@ $(VENV)/.bench: $(VENV)/.dev
 bench: test-c $(VENV)/.bench
 	build/c/tests/kernels/checkkernels --bench --model quant/models/hdl-64e.ubm
 	$(BIN)/upbeam bench --report build/bench
+	$(BIN)/upbeam estimate --validate-cpu
 
 # What takes minutes: a ten-minute stream in real time, a million damaged model files, more random scenarios.
 soak: test-c $(VENV)/.dev

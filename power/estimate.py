@@ -29,7 +29,7 @@ _UNMEASURED_DYNAMIC = 2.0
 """Factor of a dynamic energy that no row of the device confirms."""
 _UNMEASURED_RATE = 3.0
 """Besides the family's error: of a rate on a device without rows."""
-_LUTS_OF_A_NETWORK = Figure(1450, 700, 4000, "1", "assumption", "routed study of a heavier network, four lanes")
+_LUTS_OF_A_MULTIPLIER = Figure(240, 80, 500, "1", "assumption", "1,450 LUTs with 6 multipliers in a routed study")
 LUT_LIMIT, MULTIPLIER_LIMIT = 0.7, 0.8
 """Shares of a part that a design may use (FINN's timing closure guide)."""
 
@@ -358,7 +358,7 @@ def _on_fpga(device: Device, load: Load, known: Knowledge, mode: Mode | None, co
 
 def _fit(device: Device, core: FpgaCore, load: Load) -> dict[str, Any]:
     """What of the part is used. LUTs are an assumption until a core has been routed."""
-    luts, low, high = (2 * x * core.lanes for x in _LUTS_OF_A_NETWORK.span("1"))
+    luts, low, high = (x * core.multipliers for x in _LUTS_OF_A_MULTIPLIER.span("1"))
     there = device.figure("fpga.luts").get("1")
     multipliers = device.figure("fpga.multipliers").get("1")
     # Three prepared columns of four rows, 16 bits; weights of both networks.
@@ -367,7 +367,7 @@ def _fit(device: Device, core: FpgaCore, load: Load) -> dict[str, Any]:
     return {
         "multipliers": core.multipliers,
         "multipliers_of": int(multipliers),
-        "luts": {"value": luts, "low": low, "high": high, "kind": "assumption", "source": _LUTS_OF_A_NETWORK.source},
+        "luts": {"value": luts, "low": low, "high": high, "kind": "assumption", "source": _LUTS_OF_A_MULTIPLIER.source},
         "luts_of": int(there),
         "ram_bits": bits,
         "ram_bits_of": int(device.figure("fpga.ram").get("B") * 8),

@@ -17,7 +17,7 @@ from upbeam.power.deploy import target_service
 from upbeam.power.energy import measured_rows
 from upbeam.power.estimate import IMPLEMENTATIONS, Knowledge, Load, estimate_load, estimate_macs
 from upbeam.power.host import estimate_host
-from upbeam.power.measure import MeasureError
+from upbeam.power.measure import MeasureError, Recording
 from upbeam.power.ops import count_model, count_operations
 from upbeam.runtime.live import LiveConfig, run_live
 from upbeam.runtime.upsampler import load_model
@@ -162,6 +162,24 @@ def test_the_host_is_measured_and_has_no_number_without_a_sensor(model, load, tm
     json.dumps(one.as_dict(), allow_nan=False)
     with pytest.raises(MeasureError, match="no power sensor"):
         estimate_host(device("host"), load, model, measure_s=10, root=tmp_path)
+
+
+def test_the_host_with_a_sensor(model, load, monkeypatch, tmp_path):
+    """30 W at rest and 45 W while frames are computed back to back: at 20 Hz the load's share of 15 W is added."""
+    watts = iter((30.0, 45.0))
+
+    def recorded(seconds, *, root):
+        return Recording((next(watts),) * 24, 12.0, "package", "a sensor", {})
+
+    monkeypatch.setattr("upbeam.power.host.record", recorded)
+    one = estimate_host(device("host"), load, model, measure_s=12, root=tmp_path)
+    sound(one)
+    added = one.increment_w.figure.get("W")
+    assert 0 < added < 15
+    assert one.power_w.figure.get("W") == pytest.approx(30 + added)
+    assert one.energy_mj.figure.get("mJ") == pytest.approx(50 * (30 + added))
+    assert one.increment_mj.figure.get("mJ") == pytest.approx(50 * added)
+    assert one.power_w.boundary.startswith("package")
 
 
 # ------------------------------------------------------------------------------------------------------- calibration
