@@ -15,10 +15,11 @@ from upbeam.power.catalogue import cpu_core
 from upbeam.power.cycles.cpu import cpu_time
 from upbeam.power.cycles.fpga import FpgaCore, FpgaCoreError, smallest_core
 from upbeam.power.cycles.gpu import gpu_latency, window_work
-from upbeam.power.cycles.host import HostRun, core_of, predictions, worst_error
+from upbeam.power.cycles.host import HostRun, core_of, measure_host, predictions, worst_error
 from upbeam.power.cycles.kernel_ops import ISAS, kernel_ops
 from upbeam.power.figures import Figure
 from upbeam.power.ops import count_operations
+from upbeam.runtime.upsampler import load_model
 
 RUN = Path(__file__).parent / "baselines" / "cpu_kernels.json"
 GOAL = 0.20
@@ -58,6 +59,20 @@ def test_the_calibration_sees_only_what_it_may(run):
                for c in others)  # fmt: skip
     wild = tuple(replace(c, ns=c.ns if c.is_calibration else 9 * c.ns) for c in run.cases)
     assert core_of(replace(run, cases=wild)) == core_of(run)
+
+
+@pytest.mark.skipif(not _native.loop_names(), reason="no micro-benchmarks for this machine's instruction set")
+def test_a_run_on_this_machine():
+    """One short round: the calibration works; errors are printed, never asserted, since wall-clock is shared."""
+    file = load_model().file
+    live = measure_host(file, rounds=1, widths=(8,))
+    core, found = core_of(live), predictions(live)
+    assert core.mixed_per_cycle > 0
+    assert core.scalar is not None
+    assert all(ns > 0 for _, ns in found)
+    assert HostRun.from_dict(json.loads(json.dumps(live.as_dict()))) == live
+    case, error = worst_error(live)
+    print(f"worst of {len(found)}: {case.isa} {case.precision} {case.work}: {100 * error:+.1f} %")
 
 
 CORES = ("cortex-a57", "carmel", "cortex-a78ae")
