@@ -24,7 +24,18 @@ from .catalogue import CatalogueError
 from .figures import Figure
 from .toml_file import packaged, parse_toml
 
-__all__ = ["EnergyModel", "LeaveOneOut", "Row", "fit", "leave_one_out", "measured_rows", "skill", "worst_factors"]
+__all__ = [
+    "EnergyModel",
+    "LeaveOneOut",
+    "Row",
+    "as_table",
+    "fit",
+    "leave_one_out",
+    "measured_rows",
+    "peak_share",
+    "skill",
+    "worst_factors",
+]
 
 REFERENCE_NODE_NM = 28.0
 LEAST_FACTOR = 1.05
