@@ -84,6 +84,14 @@ def test_damage_and_other_messages_are_noticed(data_id: int, other: int, bit: in
     assert Receiver(11, data_id, 8, 1).check(message) == OK
 
 
+def test_a_good_checksum_does_not_make_up_for_a_wrong_header() -> None:
+    """Counter 15 is never sent; the nibble of another data id with the same low byte is another message."""
+    for second in (0x2F, 0x30):
+        body = bytes([second]) + bytes(6)
+        message = bytes([Crc8GsmA.calc(bytes([0x10, 0]) + body)]) + body
+        assert Receiver(11, 0x210, 8, 14).check(message) == WRONG_CRC
+
+
 def restated_machine(
     statuses: list[int], windows: dict[str, tuple[int, int, int]], clear_to_invalid: bool
 ) -> list[int]:

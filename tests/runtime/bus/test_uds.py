@@ -297,6 +297,7 @@ def test_gap_asked_by_the_receiver_is_kept(make_desk: Any) -> None:
     ("frames", "errors"),
     [
         (["10 14 22 fd 00 fd 00 fd", "22 00 fd 00 fd 00 fd 00"], {3: 1}),  # wrong sequence number
+        (["10 14 22 fd 00 fd 00 fd", "21 00"], {7: 1}),  # a consecutive frame that ends early
         (["21 00 fd 00 fd 00 fd 00"], {4: 1}),  # a consecutive frame of nothing
         (["30 00 00"], {4: 1}),  # flow control for nothing
         (["12 01 22 fd 00 fd 00 fd"], {5: 1}),  # 513 bytes

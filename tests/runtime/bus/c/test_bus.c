@@ -285,6 +285,14 @@ static void test_fault_cycles(void) {
         CHECK_EQUAL(entry->status & UPB_DTC_PENDING, 0);
     }
     CHECK(!(entry->status & UPB_DTC_CONFIRMED));
+    /* It fails again: ageing begins anew. A reset after cycles that ended well is noticed, too. */
+    upb_faults_report(&device.bus.faults, UPB_FAULT_NET_LOSS, UPB_MONITOR_FAILED, 0);
+    CHECK_EQUAL(entry->cycles_ok, 0);
+    CHECK_EQUAL(entry->occurrences, 2);
+    bench_step(&device, 1);
+    bench_start(&device, bench_key);
+    CHECK(upb_fault_is_active(&device.bus.faults, UPB_FAULT_POWER_RESET));
+    CHECK(entry->status & UPB_DTC_CONFIRMED);
     device.store.bytes[UPB_STORE_FAULTS][40] ^= 4;
     bench_start(&device, bench_key);
     CHECK_EQUAL(device.bus.faults.store_failures, 1);
@@ -351,6 +359,10 @@ static void test_busy_and_failing(void) {
     bench_step(&device, 200);
     CHECK(upb_fault_is_active(&device.bus.faults, UPB_FAULT_CAN_BUS_OFF));
     CHECK(device.bus.can_failed > 0);
+    const uint64_t dropped = device.bus.can.ledger_dropped;
+    upb_bus_ledger(&device.bus, &record);
+    bench_step(&device, 1);
+    CHECK_EQUAL(device.bus.can.ledger_dropped, dropped + 1);
     device.can_answer = UPB_SEND_DONE;
     bench_step(&device, 500);
     CHECK(!upb_fault_is_active(&device.bus.faults, UPB_FAULT_CAN_BUS_OFF));
