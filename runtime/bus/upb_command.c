@@ -40,25 +40,35 @@ static int is_equal(const uint8_t *a, const uint8_t *b, size_t count) {
 
 /* ---------------------------------------------------------------------------------------------- freshness */
 
+/*
+ * Magic (2), the counter (4), its complement (4), CRC-16 (2). The complement: one damage in 65536 passes a CRC-16, and
+ * a counter that was set back lets replays in.
+ */
+static void put_freshness(uint32_t freshness, uint8_t stored[UPB_STORE_FRESHNESS_BYTES]) {
+    upb_put_le(stored, STORED_MAGIC, 2);
+    upb_put_le(stored + 2, freshness, 4);
+    upb_put_le(stored + 6, ~freshness, 4);
+    upb_put_le(stored + 10, upb_crc16(UPB_CRC16_START, stored, 10), 2);
+}
+
 static int load_freshness(upb_commands *commands) {
-    uint8_t stored[UPB_STORE_FRESHNESS_BYTES];
+    uint8_t stored[UPB_STORE_FRESHNESS_BYTES] = {0}, expected[UPB_STORE_FRESHNESS_BYTES];
     if (!commands->storage.read || !commands->storage.write)
         return 0;
     const upb_stored found = commands->storage.read(commands->storage.user, UPB_STORE_FRESHNESS, stored, sizeof stored);
     if (found == UPB_STORED_NOTHING)
         return 1;
-    if (found != UPB_STORED_DONE || upb_get_le(stored, 2) != STORED_MAGIC ||
-        upb_get_le(stored + 6, 2) != upb_crc16(UPB_CRC16_START, stored, 6))
+    const uint32_t freshness = (uint32_t)upb_get_le(stored + 2, 4);
+    put_freshness(freshness, expected);
+    if (found != UPB_STORED_DONE || !is_equal(stored, expected, sizeof stored))
         return 0;
-    commands->freshness = (uint32_t)upb_get_le(stored + 2, 4);
+    commands->freshness = freshness;
     return 1;
 }
 
 static int save_freshness(upb_commands *commands, uint32_t freshness) {
     uint8_t stored[UPB_STORE_FRESHNESS_BYTES];
-    upb_put_le(stored, STORED_MAGIC, 2);
-    upb_put_le(stored + 2, freshness, 4);
-    upb_put_le(stored + 6, upb_crc16(UPB_CRC16_START, stored, 6), 2);
+    put_freshness(freshness, stored);
     return commands->storage.write(commands->storage.user, UPB_STORE_FRESHNESS, stored, sizeof stored) ==
            UPB_STORED_DONE;
 }

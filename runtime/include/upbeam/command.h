@@ -73,7 +73,7 @@ typedef struct upb_response {
  */
 typedef upb_command_result (*upb_command_fn)(void *user, const upb_command *command);
 
-#define UPB_STORE_FRESHNESS_BYTES 8u
+#define UPB_STORE_FRESHNESS_BYTES 12u
 
 typedef struct upb_commands {
     uint8_t key[UPB_KEY_BYTES];
