@@ -5,7 +5,6 @@ A column is ``blocks`` vectors of windows. For each block
     cycles = pairs of hidden units x cycles of a pair / loop efficiency      the loop over hidden units
            + other operations / mixed operations a cycle                     rules, packing, output
            + exposed                                                         steps that wait for each other
-           + the block code's own chain, in int8
 
 ``cycles of a pair`` is the scarcest resource of the loop: multiply-adds or loads. What a core does in a cycle is
 measured by micro-benchmarks (loops of independent instructions); two numbers, the efficiency of the loop and the
@@ -21,7 +20,7 @@ from dataclasses import dataclass, field
 
 from upbeam.power.figures import Figure
 
-from .kernel_ops import CHAIN_OF_BLOCK_CODE, ISAS, kernel_ops
+from .kernel_ops import ISAS, kernel_ops
 
 __all__ = ["CpuCore", "CpuTime", "cpu_cycles", "cpu_time"]
 
@@ -95,8 +94,7 @@ def cpu_cycles(core: CpuCore, isa: str, precision: str, pairs: tuple[int, int]) 
     pair = _pair_cycles(core, isa, precision)
     slope = leaky * sum(ops.leaky.values()) / core.mixed_per_cycle
     rest = sum(ops.rest.values()) / core.mixed_per_cycle + core.exposed_cycles
-    chain = CHAIN_OF_BLOCK_CODE if precision == "int8" else 0
-    return blocks * ((plain + leaky) * pair / core.loop_efficiency + slope + rest + chain)
+    return blocks * ((plain + leaky) * pair / core.loop_efficiency + slope + rest)
 
 
 def _pair_cycles(core: CpuCore, isa: str, precision: str) -> float:

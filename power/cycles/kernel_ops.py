@@ -9,14 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["CHAIN_OF_BLOCK_CODE", "ISAS", "Isa", "KernelOps", "kernel_ops"]
+__all__ = ["ISAS", "Isa", "KernelOps", "kernel_ops"]
 
 WINDOWS = 32
-
-CHAIN_OF_BLOCK_CODE = 18
-"""Dependent steps of int8's block code, in cycles: 3 ors, 3 to find the top bit (one a lookup of 2 cycles), 3 to join
-halves, 4 for the step and its half, 4 for code and limits. Nothing of the same block can run beside them."""
-
 
 @dataclass(frozen=True)
 class Isa:
@@ -94,7 +89,7 @@ def _integer_ops(isa: Isa, precision: str) -> KernelOps:
     }
     extra = {"add": 2, "logic": 2, "shift": 1 + 1 + 1 + 2 * 2, "shuffle": 2 * 2 * 4, "load": 2}
     if precision == "int8":
-        code = {"add": -1 + 2 + 6, "minmax": 1 + 1 + 6, "logic": 5 + 1 + 1 + 6, "shift": 3 + 1, "shuffle": 2}
+        code = {"add": -1 + 1 + 6, "minmax": 6, "logic": 2 + 3 + 6, "shift": 2, "shuffle": 2}
         extra = _sum(extra, code)
     return KernelOps(pair, {"multiply": 2}, _sum(_rules(isa), extra))
 
