@@ -197,7 +197,7 @@ def estimate_macs(
     the error is large, and printed. Raises CatalogueError for a mode the device does not have."""
     errors, chosen = known.errors(device), device.mode(mode)
     if device.family == "host":
-        raise CatalogueError("host: give --latency-ms, or leave --macs out: our own load is measured here")
+        return _on_unknown(device, macs, latency_ms, errors)
     if latency_ms is None:
         latency = _latency_from_macs(device, macs, known, errors)
     else:
@@ -211,6 +211,20 @@ def estimate_macs(
         Bounded(latency, "one inference"), Bounded(power, f"{boundary}, while computing"),
         Bounded(joules, f"{boundary}, one inference"), errors, _dominates(device, row, known),
         notes=_notes(device, known),
+    )  # fmt: skip
+
+
+def _on_unknown(device: Device, macs: float, latency_ms: float | None, errors: Errors) -> Estimate:
+    """A workload on a machine that nothing is known of but what it was told."""
+    if latency_ms is None:
+        raise CatalogueError(
+            f"{device.name}: no measured row tells its latency: give --latency-ms, or leave --macs out"
+        )
+    why = "no measured row of this machine: power is not known"
+    return Estimate(
+        device, "cpu", None, f"{macs:.4g} MAC, back to back", macs,
+        Bounded(Figure.exact(latency_ms, "ms", "given", "given by the user"), "one inference"),
+        Bounded(Figure.absent("W", why), "none"), Bounded(Figure.absent("mJ", why), "none"), errors, "not known",
     )  # fmt: skip
 
 
@@ -293,7 +307,8 @@ def cpu_column_time(device: Device, load: Load, mode: Mode | None) -> CpuTime:
     if clock is None:
         raise CatalogueError(f"{device.name}: no CPU clock to estimate with")
     core: CpuCore = cpu_core(device.texts["cpu.core"])
-    return cpu_time(core, device.texts["cpu.isa"], load.precision, load.pairs, clock.get("GHz"))
+    bandwidth = device.figure("memory.bandwidth").get("GB/s")
+    return cpu_time(core, device.texts["cpu.isa"], load.precision, load.pairs, clock.get("GHz"), bandwidth)
 
 
 def _on_cpu(device: Device, load: Load, known: Knowledge, mode: Mode | None, _: FpgaCore | None) -> Estimate:

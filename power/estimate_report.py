@@ -93,6 +93,7 @@ def _page(
         "skill": {w: energy.skill(known.results, w) for w in ("power", "latency", "energy")},
         "assumptions": _figures_of(lambda kind: kind == "assumption"),
         "measured": _figures_of(lambda kind: kind.startswith("measured")),
+        "data_sheets": _data_sheets(),
         "sources": list(dict.fromkeys(row.source for row in known.model.rows)),
         "environment": [(k, v) for k, v in _flat(environment) if k in _ENVIRONMENT],
     }
@@ -189,6 +190,16 @@ def _figures_of(wanted: Any) -> list[tuple[str, str, str, str]]:
                 text = f"{figure.value:g}{interval} {figure.unit}"
                 found.setdefault((key, text, figure.source + by), []).append(name)
     return [(", ".join(names), key, value, source) for (key, value, source), names in found.items()]
+
+
+def _data_sheets() -> list[tuple[str, str]]:
+    """Each source, and whose figures are from it."""
+    found: dict[str, list[str]] = {}
+    for name in device_names():
+        for _, figure in device(name).every_figure():
+            if figure.kind == "data sheet" and name not in found.setdefault(figure.source, []):
+                found[figure.source].append(name)
+    return [(source, ", ".join(names)) for source, names in found.items()]
 
 
 # --------------------------------------------------------------------------------------------------------- pictures

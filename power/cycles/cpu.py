@@ -70,17 +70,24 @@ class CpuTime:
         return Figure(value, low, high, "ms", self.push.kind, self.push.source)
 
 
-def cpu_time(core: CpuCore, isa: str, precision: str, pairs: tuple[int, int], clock_ghz: float) -> CpuTime:
-    """``pairs``: of hidden units without and with a slope, both networks together (``unit_pairs``). Raises ValueError
-    for an instruction set the core has no figures of."""
+COLUMN_BYTES = (32 + 64) * 3
+"""In from and out to memory, for a column; everything else stays in a first-level cache."""
+
+
+def cpu_time(
+    core: CpuCore, isa: str, precision: str, pairs: tuple[int, int], clock_ghz: float, gb_per_s: float | None = None
+) -> CpuTime:
+    """``pairs``: of hidden units without and with a slope, both networks together (``unit_pairs``). ``gb_per_s``: of
+    memory, which bounds the time from below. Raises ValueError for an instruction set the core has no figures of."""
     if not clock_ghz > 0:
         raise ValueError(f"clock {clock_ghz} GHz, expected above 0")
     cycles = cpu_cycles(core, isa, precision, pairs)
-    return CpuTime(*(_time(core, isa, precision, x, clock_ghz) for x in (cycles, cycles + core.push_cycles)))
+    least = 0.0 if gb_per_s is None else COLUMN_BYTES / gb_per_s
+    return CpuTime(*(_time(core, isa, precision, x, clock_ghz, least) for x in (cycles, cycles + core.push_cycles)))
 
 
-def _time(core: CpuCore, isa: str, precision: str, cycles: float, clock_ghz: float) -> Figure:
-    ns = cycles / clock_ghz
+def _time(core: CpuCore, isa: str, precision: str, cycles: float, clock_ghz: float, least_ns: float) -> Figure:
+    ns = max(cycles / clock_ghz, least_ns)
     source = f"operation counts of the {precision} kernel, {core.name} {isa} at {clock_ghz:.2f} GHz: {core.source}"
     return Figure(ns, ns / core.low, ns * core.high, "ns", core.kind, source)
 

@@ -108,6 +108,13 @@ def test_the_pair_cycles_of_docs_performance():
     assert cycles / 32 == pytest.approx(58, rel=0.01)
 
 
+def test_memory_bounds_the_time_from_below():
+    core = cpu_core("cortex-a57")
+    fast, slow = (cpu_time(core, "neon", "int8", (12, 0), 1.5, gb_per_s=x).push.value for x in (25.6, 0.01))
+    assert fast == cpu_time(core, "neon", "int8", (12, 0), 1.5).push.value
+    assert slow == pytest.approx(288 / 0.01)
+
+
 def test_unknown_instruction_sets_and_precisions():
     with pytest.raises(ValueError, match="no operation counts for 'sse'"):
         kernel_ops("sse", "fp32")

@@ -148,8 +148,11 @@ def test_what_cannot_be_estimated(known, load):
         estimate_load(device("jetson-nano"), load, known=known, mode="fast")
     with pytest.raises(CatalogueError, match="runs our load on fpga"):
         estimate_load(device("ecp5-25"), load, known=known, implementation="gpu")
-    with pytest.raises(CatalogueError, match="measured here"):
+    with pytest.raises(CatalogueError, match="give --latency-ms"):
         estimate_macs(device("host"), 1e6, known=known)
+    unknown = estimate_macs(device("host"), 1e6, 2.0, known=known)
+    assert unknown.power_w.figure.kind == "none"
+    assert unknown.latency_ms.figure.get("ms") == 2.0
 
 
 def test_the_host_is_measured_and_has_no_number_without_a_sensor(model, load, tmp_path, monkeypatch):

@@ -105,6 +105,8 @@ def stream(
         from .stream_report import write_stream_report
 
         source_facts = {key: str(summary[key]) for key in ("source", "sensor", "kind", "backend", "precision")}
+        if deployed is not None:
+            source_facts |= _target_facts(summary["target"])
         page = write_stream_report(report, feed.images, feed.truth, feed.pictured, loaded, result, source_facts)
         summary["report"] = str(page)
     if as_json:
@@ -253,6 +255,17 @@ def _print(summary: dict[str, Any], result: LiveResult) -> None:
         message(f"report: {summary['report']}")
     if result.stopped:
         message("stopped early")
+
+
+def _target_facts(target: dict[str, Any]) -> dict[str, str]:
+    """For the report."""
+    column, sensors = target["column_us"], target["sensors"]
+    return {
+        "target": f"{target['device']} {target['mode'] or ''}".strip(),
+        "column on the target (us)": f"{column['value']:.3g} ({column['low']:.3g} to {column['high']:.3g}), modelled",
+        "least margin (ms)": "unknown" if target["margin_ms"] is None else f"{target['margin_ms']:.3f}",
+        "sensors that fit": f"{sensors['value']} ({sensors['low']} to {sensors['high']})",
+    }
 
 
 def _print_target(target: dict[str, Any], result: LiveResult) -> None:
