@@ -197,6 +197,10 @@ def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.3g}"
 
 
+def _bound(value: float) -> str:
+    return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
+
+
 def _factor(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}" if value < 10 else f"{value:.0f}"
 
@@ -250,20 +254,23 @@ def _overview(found: Sequence[Estimate], load: Load) -> Any:
     rows = [
         [
             f"{one.device.name} {one.implementation}", str(one.met), _interval(one.latency_ms, "ms"),
-            _interval(one.power_w, "W") + ("*" if one.power_w.figure.kind == "assumption" else ""),
+            _interval(one.power_w, "W", "*" if one.power_w.figure.kind == "assumption" else ""),
             "-" if one.increment_w is None else _interval(one.increment_w, "mW"),
         ]
         for one in found
     ]  # fmt: skip
-    title = f"Both images of a 32 x {load.columns} frame at {load.rate_hz:g} Hz, deadline {load.deadline_ms:g} ms"
-    return table(title, ["", "met", "ms", "W (*: assumed)", "mW of them added"], rows)
+    title = (
+        f"Both images of a 32 x {load.columns} frame at {load.rate_hz:g} Hz, deadline {load.deadline_ms:g} ms; "
+        "*: an assumption"
+    )
+    return table(title, ["", "met", "ms", "W", "mW added"], rows)
 
 
-def _interval(bounded: Bounded, unit: str) -> str:
+def _interval(bounded: Bounded, unit: str, mark: str = "") -> str:
     if not bounded.figure.known:
         return "-"
     value, low, high = bounded.figure.span(unit)
-    return f"{_short(value)} ({low:.2g}..{high:.2g})"
+    return f"{_short(value)}{mark} ({_bound(low)}..{_bound(high)})"
 
 
 def _list_devices(as_json: bool) -> None:
