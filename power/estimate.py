@@ -308,7 +308,15 @@ def cpu_column_time(device: Device, load: Load, mode: Mode | None) -> CpuTime:
         raise CatalogueError(f"{device.name}: no CPU clock to estimate with")
     core: CpuCore = cpu_core(device.texts["cpu.core"])
     bandwidth = device.figure("memory.bandwidth").get("GB/s")
-    return cpu_time(core, device.texts["cpu.isa"], load.precision, load.pairs, clock.get("GHz"), bandwidth)
+    found = cpu_time(core, device.texts["cpu.isa"], load.precision, load.pairs, clock.get("GHz"), bandwidth)
+    return CpuTime(*(_at_clock(figure, clock) for figure in (found.kernels, found.push)))
+
+
+def _at_clock(time: Figure, clock: Figure) -> Figure:
+    """The interval of the clock widens that of the time."""
+    value, low, high = time.span("ns")
+    central, slow, fast = clock.span("GHz")
+    return replace(time, value=value, low=low * central / fast, high=high * central / slow, unit="ns")
 
 
 def _on_cpu(device: Device, load: Load, known: Knowledge, mode: Mode | None, _: FpgaCore | None) -> Estimate:

@@ -182,7 +182,10 @@ def _figures_of(wanted: Any) -> list[tuple[str, str, str, str]]:
     """Device, figure, value and source, of figures of a kind; the same source and figure of several devices once."""
     found: dict[tuple[str, str, str], list[str]] = {}
     for name in device_names():
-        for key, figure in device(name).every_figure():
+        board = device(name)
+        for key, figure in board.every_figure():
+            if key.startswith("modes.") and not key.startswith(f"modes.{board.default_mode}."):
+                continue  # of the modes that no estimate of this page is in
             if wanted(figure.kind):
                 low, high = figure.low, figure.high
                 interval = "" if low == high else f" ({low:g} to {high:g})"
