@@ -117,3 +117,11 @@ def test_operations_of_any_model(as_json):
     assert found["macs_per_frame_dense"] == 39_616_512
     assert found["memory"]["state_int8"] == 1792
     assert {x["key"] for x in found["paper"]} >= {"macs_per_frame_dense", "total_bytes"}
+
+
+def test_operations_of_any_widths(upbeam, as_json):
+    assert as_json("ops", "--widths", "8,2,12")["macs_per_window_dense"] == 312
+    assert as_json("ops", "--widths", "4,1,6", "--columns", 100)["macs_per_window_executed"] == 48
+    assert "three whole numbers" in upbeam("ops", "--widths", "8,2", status=2)
+    assert "instead of --model" in upbeam("ops", "--widths", "8,2,12", "--model", "hdl-64e", status=2)
+    assert "must all be at least 1" in upbeam("ops", "--widths", "8,0,12", status=2)

@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from upbeam.power.ops import OperationCount, count_model
+from upbeam.power.ops import OperationCount, count_model, count_operations
 from upbeam.runtime.upsampler import load_model
 
-from .common import JsonOption, emit_json, show, table
+from .common import JsonOption, UserError, emit_json, show, table
 
 __all__ = ["ops"]
 
@@ -20,18 +20,38 @@ def ops(
     columns: Annotated[
         int | None, typer.Option(min=4, max=65535, help="Columns per turn instead of the model's.")
     ] = None,
+    widths: Annotated[
+        str | None, typer.Option(help="Another network of the family: filters, filters, hidden units, as 8,2,12.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Count operations and memory of a model's networks."""
+    """Count operations and memory of a model's networks, or of any widths."""
+    if widths is not None:
+        if model is not None:
+            raise UserError("--widths is instead of --model")
+        _give(count_operations(_numbers(widths), columns or 2048), None, as_json)
+        return
     loaded = load_model(model)
     width = columns or loaded.columns
     sizes = {precision: loaded.sizes(precision, columns=width) for precision in loaded.precisions}
     memory = {f"{name}_{precision}": n for precision, found in sizes.items() for name, n in found.items()}
     count = count_model(loaded.file, width, memory)
+    _give(count, f"{loaded.crc32:08x}", as_json)
+
+
+def _numbers(text: str) -> tuple[int, int, int]:
+    try:
+        conv1, conv2, hidden = (int(x) for x in text.split(","))
+    except ValueError:
+        raise UserError(f"--widths {text!r}: expected three whole numbers with commas, as 8,2,12") from None
+    return conv1, conv2, hidden
+
+
+def _give(count: OperationCount, crc32: str | None, as_json: bool) -> None:
     if as_json:
-        emit_json({**count.as_dict(), "model_crc32": f"{loaded.crc32:08x}"})
-        return
-    _print(count)
+        emit_json({**count.as_dict(), "model_crc32": crc32})
+    else:
+        _print(count)
 
 
 def _print(count: OperationCount) -> None:
