@@ -51,6 +51,9 @@ _SECTIONS: dict[str, dict[str, str]] = {
     "scheduling": {"wakeup": "time"},
 }
 _MODE_KEYS = {"budget": "power", "cpu_cores": "number", "cpu_clock": "rate", "gpu_clock": "rate"}
+_MODE_REQUIRED = ("cpu_cores", "cpu_clock", "gpu_clock")
+_ABOVE_0 = ("rate", "bandwidth", "throughput", "time", "length")
+"""Dimensions that are divided by: 0 makes no device."""
 _REQUIRED = {
     "jetson": ("cpu.core", "cpu.isa", "memory.size", "memory.bandwidth", "gpu.peak", "gpu.clock", "gpu.launch",
                "power.boundary", "power.idle", "power.cpu_active", "power.node", "scheduling.wakeup"),
@@ -201,6 +204,8 @@ class _Reader:
             raise self._error("cpu", "core", f"{texts['cpu.core']!r}: expected one of {', '.join(_cores())}")
         top = {key: texts.pop(key, "") for key in ("name", "title", "family", "note", "default_mode")}
         device = Device(**top, path=self._name, texts=texts, figures=figures, modes=self._modes())
+        if family == "jetson" and not device.modes:
+            raise self._error("", "", "a jetson device needs at least one section [modes.NAME]")
         if device.modes and device.default_mode not in device.modes:
             expected = ", ".join(device.modes)
             raise self._error("", "default_mode", f"{device.default_mode!r}: expected one of {expected}")
@@ -250,6 +255,9 @@ class _Reader:
                 if key not in _MODE_KEYS:
                     raise self._error(section, key, f"is unknown, expected one of: {', '.join(_MODE_KEYS)}")
                 figures[key] = self._figure(section, key, value, _MODE_KEYS[key])
+            for key in _MODE_REQUIRED:
+                if key not in figures:
+                    raise self._error(section, "", f"{key} is missing: a mode needs it")
             found[name] = Mode(name, figures)
         return found
 
@@ -270,6 +278,8 @@ class _Reader:
         for number in numbers:
             if isinstance(number, bool) or not isinstance(number, (int, float)) or not number >= 0:
                 raise self._error(section, key, f"{number!r}: expected a number of at least 0")
+            if number == 0 and dimension in _ABOVE_0:
+                raise self._error(section, key, f"{number!r}: expected a number above 0")
         kind, unit, source = (value[k] for k in ("kind", "unit", "source"))
         if kind not in ("data sheet", "assumption") and not re.fullmatch(r"measured by \S.*", str(kind)):
             raise self._error(section, key, f"kind {kind!r}: expected 'data sheet', 'measured by NAME' or 'assumption'")

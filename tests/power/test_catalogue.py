@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from upbeam.power.catalogue import CatalogueError, cpu_core, device, device_names, read_device
+from upbeam.power.toml_file import packaged
 
 EXPECTED = {
     "jetson-nano", "jetson-tx2", "jetson-xavier-nx", "jetson-agx-xavier", "jetson-orin-nano", "jetson-orin-nx",
@@ -65,6 +66,13 @@ def test_a_users_file(tmp_path):
         mine.mode("fast")
 
 
+MODE = """\
+[modes.fast]
+cpu_cores = { value = 1, unit = "1", kind = "data sheet", source = "x" }
+cpu_clock = { value = 1, unit = "GHz", kind = "data sheet", source = "x" }
+gpu_clock = { value = 1, unit = "GHz", kind = "data sheet", source = "x" }
+"""
+
 BAD = {
     "no line end": (' = "my-board"', " = my-board", r"board.toml: .*line 1"),
     "misspelt key": ("luts = ", "lutz = ", r"board.toml:6: \[fpga\] lutz: is unknown, expected one of: luts"),
@@ -87,8 +95,10 @@ BAD = {
     "infinite": ("value = 20", "value = inf", r"board.toml:14: .*finite"),
     "not a number": ("value = 20", "value = nan", r"board.toml:14: .*nan: expected a number"),
     "truth value": ("value = 20", "value = true", r"board.toml:14: .*True: expected a number"),
-    "mode without default": ("[power]", '[modes.fast]\ncpu_clock = { value = 1, unit = "GHz", kind = "data sheet", '
-                             'source = "x" }\n\n[power]', r"board.toml:1: default_mode: '': expected one of fast"),
+    "clock of 0": ("value = 50, low = 40", "value = 50, low = 0", r"board.toml:10: .*0: expected a number above 0"),
+    "mode without clocks": ("[power]", '[modes.fast]\nbudget = { value = 1, unit = "W", kind = "data sheet", '
+                            'source = "x" }\n\n[power]', r"board.toml:12: \[modes.fast\]: cpu_cores is missing"),
+    "mode without default": ("[power]", MODE + "\n[power]", r"board.toml:1: default_mode: '': expected one of fast"),
 }  # fmt: skip
 
 
@@ -98,6 +108,12 @@ def test_a_bad_file_is_refused_with_line_and_reason(what, tmp_path):
     assert old in GOOD
     with pytest.raises(CatalogueError, match=message):
         read_device(write(tmp_path, GOOD.replace(old, new, 1)))
+
+
+def test_a_module_without_modes(tmp_path):
+    text = (packaged("devices", "jetson-nano.toml")).read_text()
+    with pytest.raises(CatalogueError, match="needs at least one section"):
+        read_device(write(tmp_path, text.split("[modes.")[0]))
 
 
 def test_files_that_are_no_text(tmp_path):

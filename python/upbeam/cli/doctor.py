@@ -12,6 +12,7 @@ from typing import Any
 
 import upbeam
 from upbeam.kernels.opencl import OpenClError, list_devices
+from upbeam.power.measure.sensors import find_sensors, no_sensor
 from upbeam.runtime import _native
 from upbeam.runtime.upsampler import load_model
 
@@ -47,6 +48,7 @@ def environment() -> dict[str, Any]:
         "cpu_features": _cpu_flags(),
         "instruction_sets": _usable_sets(),
         "opencl_devices": _opencl_devices(),
+        "power_sensors": [f"{s.name}: {s.boundary} ({s.detail})" for s in find_sensors()] or no_sensor(),
         "packages": {name: _version(name) for name in PACKAGES},
         "tools": {name: _tool(name) for name in TOOLS},
     }
