@@ -6,10 +6,10 @@ A column is ``blocks`` vectors of windows. For each block
            + other operations / mixed operations a cycle                     rules, packing, output
            + exposed                                                         steps that wait for each other
 
-``cycles of a pair`` is the scarcest resource of the loop: multiply-adds or loads. What a core does in a cycle is
-measured by micro-benchmarks (loops of independent instructions); two numbers, the efficiency of the loop and the
-exposed cycles, come from the AVX2 float kernel at two widths. Nothing is fitted on the kernels that are predicted:
-AVX-512, integers, other widths. Where nothing can be run, pair cycles are those of a static analysis
+``cycles of a pair`` is the scarcest resource of the loop: multiply-adds, vector operations or loads. What a core does
+in a cycle is measured by micro-benchmarks (loops of independent instructions); two numbers, the efficiency of the loop
+and the exposed cycles, come from the AVX2 float kernel at two widths. Nothing is fitted on the kernels that are
+predicted: AVX-512, integers, other widths. Where nothing can be run, pair cycles are those of a static analysis
 (docs/performance.md) and the rest is an assumption, with an interval that says so.
 """
 
@@ -46,6 +46,8 @@ class CpuCore:
     """of each instruction set: fused multiply-adds of floats"""
     dot_per_cycle: Mapping[str, float] = field(default_factory=dict)
     """of each instruction set: 16-bit dot products with their addition"""
+    vector_per_cycle: float = 4.0
+    """vector operations of any kind, loads aside"""
     loads_per_cycle: float = 2.0
     pair_cycles: Mapping[str, float] = field(default_factory=dict)
     """of each precision, instead of the rates: cycles for two hidden units and one block"""
@@ -113,7 +115,13 @@ def _pair_cycles(core: CpuCore, isa: str, precision: str) -> float:
     if isa not in rates:
         raise ValueError(f"{core.name}: no rates of {isa}, known: {', '.join(rates)}")
     counts = kernel_ops(isa, precision).pair
-    return max(counts["multiply_add"] / rates[isa], counts["load"] / core.loads_per_cycle)
+    apart = precision != "fp32" and not ISAS[isa].fused_dot
+    vector = sum(counts.values()) - counts["load"] + (counts["multiply_add"] if apart else 0)
+    return max(
+        counts["multiply_add"] / rates[isa],
+        vector / core.vector_per_cycle,
+        counts["load"] / core.loads_per_cycle,
+    )
 
 
 def _scalar_cycles(core: CpuCore, pairs: tuple[int, int]) -> float:

@@ -13,6 +13,7 @@ __all__ = ["ISAS", "Isa", "KernelOps", "kernel_ops"]
 
 WINDOWS = 32
 
+
 @dataclass(frozen=True)
 class Isa:
     """What of an instruction set changes the counts."""
