@@ -54,3 +54,17 @@ upb_status upb_check_memory(const void *memory, size_t bytes, size_t needed, upb
         return upb_fail(error, UPB_E_SIZE, "memory_bytes", 0, bytes, needed);
     return UPB_OK;
 }
+
+/* Half a byte at a time: a table of 64 bytes instead of 1024. */
+uint32_t upb_crc32(uint32_t crc, const void *bytes, size_t size) {
+    static const uint32_t table[16] = {0x00000000, 0x1db71064, 0x3b6e20c8, 0x26d930ac, 0x76dc4190, 0x6b6b51f4,
+                                       0x4db26158, 0x5005713c, 0xedb88320, 0xf00f9344, 0xd6d6a3e8, 0xcb61b38c,
+                                       0x9b64c2b0, 0x86d3d2d4, 0xa00ae278, 0xbdbdf21c};
+    const uint8_t *byte = bytes;
+    crc = ~crc;
+    for (size_t i = 0; i < size; i++) {
+        crc = crc >> 4 ^ table[(crc ^ byte[i]) & 15];
+        crc = crc >> 4 ^ table[(crc ^ (uint32_t)(byte[i] >> 4)) & 15];
+    }
+    return ~crc;
+}

@@ -34,4 +34,14 @@ upb_status upb_check_memory(const void *memory, size_t bytes, size_t needed, upb
 /* floor(offset * columns / 360 degrees + 0.5), exact. */
 int32_t upb_offset_columns(int32_t offset_udeg, uint32_t columns);
 
+/* CRC-32 (CRC-32/ISO-HDLC) of bytes that follow others whose CRC is `crc`; 0 to begin. */
+uint32_t upb_crc32(uint32_t crc, const void *bytes, size_t size);
+
+/*
+ * The generated rows of one column in every mode but NETWORK. distance, intensity: [UPB_BEAMS] of the sensor;
+ * out_*: [UPB_LANES], of which lane UPB_WINDOWS has no meaning.
+ */
+void upb_ladder_column(const upb_model_info *info, upb_mode mode, const uint16_t *distance, const uint8_t *intensity,
+                       uint16_t *out_distance, uint8_t *out_intensity);
+
 #endif /* UPB_INTERNAL_H */

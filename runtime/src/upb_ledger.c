@@ -75,7 +75,7 @@ static void judge(upb_ledger *ledger, upb_ledger_record *record, uint32_t partia
 
 upb_status upb_ledger_output(upb_ledger *ledger, uint64_t frame, uint32_t missing_columns, uint32_t partial,
                              uint32_t mode, upb_ledger_record *record) {
-    if (!ledger || mode > UPB_MODE_NETWORK)
+    if (!ledger || mode >= UPB_MODES)
         return UPB_E_ARGUMENT;
     const uint32_t index = find_open(ledger, frame);
     if (index == ledger->open_count)

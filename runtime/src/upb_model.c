@@ -20,19 +20,6 @@ enum {
 
 /* ----------------------------------------------------------------------------------------------- frame */
 
-/* CRC-32 ISO-HDLC, half a byte at a time: a table of 64 bytes instead of 1024. */
-static uint32_t crc32_of(const uint8_t *bytes, size_t size) {
-    static const uint32_t table[16] = {0x00000000, 0x1db71064, 0x3b6e20c8, 0x26d930ac, 0x76dc4190, 0x6b6b51f4,
-                                       0x4db26158, 0x5005713c, 0xedb88320, 0xf00f9344, 0xd6d6a3e8, 0xcb61b38c,
-                                       0x9b64c2b0, 0x86d3d2d4, 0xa00ae278, 0xbdbdf21c};
-    uint32_t crc = 0xffffffffu;
-    for (size_t i = 0; i < size; i++) {
-        crc = crc >> 4 ^ table[(crc ^ bytes[i]) & 15];
-        crc = crc >> 4 ^ table[(crc ^ (uint32_t)(bytes[i] >> 4)) & 15];
-    }
-    return ~crc;
-}
-
 /* Checks the header and the checksum. `sections` receives the number of sections. */
 static upb_status read_header(const upb_reader *r, uint32_t *sections, uint32_t *crc) {
     uint32_t file_bytes;
@@ -52,7 +39,7 @@ static upb_status read_header(const upb_reader *r, uint32_t *sections, uint32_t 
     if (file_bytes != r->size)
         return upb_fail(r->error, UPB_E_TRUNCATED, "file_bytes", 8, r->size, file_bytes);
     *crc = upb_u32_at(r, r->size - CRC_BYTES);
-    uint32_t computed = crc32_of(r->bytes, r->size - CRC_BYTES);
+    uint32_t computed = upb_crc32(0, r->bytes, r->size - CRC_BYTES);
     if (*crc != computed)
         return upb_fail(r->error, UPB_E_CRC, "crc32", r->size - CRC_BYTES, *crc, computed);
     for (size_t at = 16; at < HEADER_BYTES; at++)

@@ -63,6 +63,7 @@ struct upb_stream {
     void *user;
     uint32_t columns;
     uint32_t reorder_columns;
+    upb_mode mode; /* of the next finished column */
     upb_stream_stats stats;
     destagger beams;
 
@@ -301,6 +302,41 @@ upb_status upb_stream_get_stats(const upb_stream *stream, upb_stream_stats *stat
     return UPB_OK;
 }
 
+upb_status upb_stream_set_mode(upb_stream *stream, upb_mode mode) {
+    if (!stream || (uint32_t)mode >= UPB_MODES)
+        return UPB_E_ARGUMENT;
+    stream->mode = mode;
+    return UPB_OK;
+}
+
+upb_status upb_stream_checksum(const upb_stream *stream, uint32_t *checksum) {
+    if (!stream || !checksum)
+        return UPB_E_ARGUMENT;
+    /* Field by field: padding has no value. */
+    const upb_stream *const s = stream;
+    const struct {
+        const void *at;
+        size_t bytes;
+    } parts[] = {{&s->prepare_f32, sizeof s->prepare_f32},
+                 {&s->windows_f32, sizeof s->windows_f32},
+                 {&s->prepare_int, sizeof s->prepare_int},
+                 {&s->windows_int, sizeof s->windows_int},
+                 {&s->model, sizeof s->model},
+                 {&s->integer, sizeof s->integer},
+                 {&s->prepared, sizeof s->prepared},
+                 {&s->sink, sizeof s->sink},
+                 {&s->user, sizeof s->user},
+                 {&s->columns, sizeof s->columns},
+                 {&s->ring, sizeof s->ring},
+                 {&s->reorder_columns, sizeof s->reorder_columns},
+                 {&s->beams, sizeof s->beams}};
+    uint32_t crc = 0;
+    for (size_t i = 0; i < sizeof parts / sizeof parts[0]; i++)
+        crc = upb_crc32(crc, parts[i].at, parts[i].bytes);
+    *checksum = crc;
+    return UPB_OK;
+}
+
 /* -------------------------------------------------------------------------------------- azimuth columns */
 
 static void prepare(const upb_stream *s, upb_prepared *prepared, const uint16_t *distance, const uint8_t *intensity) {
@@ -320,7 +356,9 @@ static void prepare_collected(const upb_stream *s, upb_prepared *prepared, const
 }
 
 static void make_windows(const upb_stream *s, const upb_prepared *right, uint16_t *distance, uint8_t *intensity) {
-    if (s->integer)
+    if (s->mode != UPB_MODE_NETWORK)
+        upb_ladder_column(&s->model->info, s->mode, s->own_distance, s->own_intensity, distance, intensity);
+    else if (s->integer)
         s->windows_int(s->integer, s->left, s->middle, right, distance, intensity);
     else
         s->windows_f32(&s->model->f32, s->left, s->middle, right, distance, intensity);
@@ -333,14 +371,15 @@ static void finish(upb_stream *s, const upb_prepared *right) {
     make_windows(s, right, distance, intensity);
     interleave_rows(UPB_BEAMS, s->out_distance, s->out_intensity, s->own_distance, s->own_intensity, distance,
                     intensity);
-    const int repeat = s->model->info.last_row == UPB_LAST_ROW_REPEAT;
+    const int repeat = s->model->info.last_row == UPB_LAST_ROW_REPEAT && s->mode != UPB_MODE_PASS_THROUGH;
     s->out_distance[UPB_ROWS - 1] = repeat ? s->own_distance[UPB_BEAMS - 1] : 0;
     s->out_intensity[UPB_ROWS - 1] = repeat ? s->own_intensity[UPB_BEAMS - 1] : 0;
     s->pending = 0;
     s->stats.columns_out++;
     s->stats.frames_out += (s->pending_flags & UPB_COLUMN_LAST) != 0;
     if (s->sink) {
-        const upb_column column = {s->pending_place.frame, s->pending_place.column, s->pending_flags, s->out_distance,
+        const upb_column column = {s->pending_place.frame, s->pending_place.column,
+                                   s->pending_flags | (uint32_t)s->mode << UPB_COLUMN_MODE_SHIFT, s->out_distance,
                                    s->out_intensity};
         s->sink(s->user, &column);
     }

@@ -187,7 +187,26 @@ typedef enum upb_cpu {
  * fired yet, those that look back did not fire any more.
  */
 #define UPB_COLUMN_INCOMPLETE 1u
-#define UPB_COLUMN_LAST 2u /* last column of its frame: columns-1 */
+#define UPB_COLUMN_LAST 2u       /* last column of its frame: columns-1 */
+#define UPB_COLUMN_MODE_SHIFT 8u /* bits 8 and 9: the upb_mode that made the column's generated rows */
+
+/*
+ * How generated rows are made, from dearest to cheapest: the degradation ladder. The sensor's own rows are the same in
+ * every mode. Range limits are those of the model in every mode: a pixel of a row beyond its limits is not seen, and
+ * what is generated beyond its own is no return. Only NETWORK depends on the stream's precision.
+ */
+typedef enum upb_mode {
+    UPB_MODE_NETWORK = 0,
+    /*
+     * The mean of those of the two vertical neighbours that are seen: (a + b + 1) / 2 in whole numbers, so that halves
+     * round up; one alone as it is; none: no return. Intensities follow the distances. model/baselines.py, valid-mean
+     */
+    UPB_MODE_VALID_MEAN = 1,
+    UPB_MODE_REPEAT = 2,      /* the upper neighbour, if seen: model/baselines.py, nearest */
+    UPB_MODE_PASS_THROUGH = 3 /* generated rows are no return, row 63 too */
+} upb_mode;
+
+#define UPB_MODES 4u
 
 /* A finished column. The arrays belong to the stream and are valid during the call of the sink. */
 typedef struct upb_column {
@@ -200,6 +219,11 @@ typedef struct upb_column {
 
 /* True for rows that no laser measured. */
 static inline int upb_row_is_generated(uint32_t row) { return (int)(row & 1u); }
+
+/* The mode that made the column's generated rows. */
+static inline upb_mode upb_column_mode(const upb_column *column) {
+    return (upb_mode)(column->flags >> UPB_COLUMN_MODE_SHIFT & 3u);
+}
 
 /* Must not call the stream that calls it. */
 typedef void (*upb_column_sink)(void *user, const upb_column *column);
@@ -285,7 +309,21 @@ UPB_API upb_status upb_stream_gap(upb_stream *stream, uint32_t columns);
  */
 UPB_API upb_status upb_stream_flush(upb_stream *stream);
 
-/* Forgets all columns and counts, as after upb_stream_init. */
+/*
+ * How generated rows are made from the next finished column on: that is the one after the last the sink saw, whose own
+ * firing was pushed delay_columns before. A new stream is in UPB_MODE_NETWORK; reset and flush keep the mode. A column
+ * depends on its own mode only, not on those before it. Errors: ARGUMENT.
+ */
+UPB_API upb_status upb_stream_set_mode(upb_stream *stream, upb_mode mode);
+
+/*
+ * A checksum (CRC-32) of what does not change in a stream after upb_stream_init: how beams are destaggered, sizes,
+ * which functions and which model it uses. Two calls that differ tell that the memory was damaged between them. The
+ * mode and what the stream knows of columns are not in it. Errors: ARGUMENT.
+ */
+UPB_API upb_status upb_stream_checksum(const upb_stream *stream, uint32_t *checksum);
+
+/* Forgets all columns and counts, as after upb_stream_init; the mode stays. */
 UPB_API upb_status upb_stream_reset(upb_stream *stream);
 
 UPB_API upb_status upb_stream_get_stats(const upb_stream *stream, upb_stream_stats *stats);
@@ -350,8 +388,6 @@ typedef enum upb_verdict {
     UPB_VERDICT_MISSED = 1, /* latency above the deadline */
     UPB_VERDICT_PARTIAL = 2 /* the frame began or ended outside the stream: shown, not judged */
 } upb_verdict;
-
-typedef enum upb_mode { UPB_MODE_NETWORK = 0 } upb_mode;
 
 /* One frame: the same record in C, JSON, CAN and serial. */
 typedef struct upb_ledger_record {
