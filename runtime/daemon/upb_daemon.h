@@ -23,6 +23,8 @@
 #ifndef UPB_DAEMON_H
 #define UPB_DAEMON_H
 
+#include "upbeam/bus.h"
+#include "upbeam/packets.h"
 #include "upbeam/upbeam.h"
 
 #ifdef __cplusplus
@@ -40,14 +42,15 @@ typedef enum upb_drop {
     UPB_DROP_WRONG_SOURCE = 2, /* from another address than config.source_ipv4 */
     UPB_DROP_DUPLICATE = 3,    /* the same sensor time and azimuth as one already taken */
     UPB_DROP_LATE = 4,         /* overtaken: older than one already taken */
-    UPB_DROP_FLOOD = 5,        /* more packets than the sensor sends, and this one does not continue its sequence */
+    UPB_DROP_FLOOD = 5,        /* during a flood of packets to refuse, one that does not continue the sequence */
     UPB_DROP_QUEUE = 6,        /* the queue before the step was full */
     UPB_DROP_STALE = 7,        /* waited longer than config.stale_ns */
     UPB_DROP_STUCK = 8,        /* the azimuth does not move: the measured directions are unknown */
-    UPB_DROP_ENDED = 9         /* came after upb_daemon_end */
+    UPB_DROP_JUMP = 9,  /* its sensor time does not follow the last one's, and no second packet has confirmed it */
+    UPB_DROP_ENDED = 10 /* came after upb_daemon_end */
 } upb_drop;
 
-#define UPB_DROPS 10u
+#define UPB_DROPS 11u
 
 /* Static, never null; "?" for a number that is no cause. */
 const char *upb_drop_name(uint32_t drop);
@@ -89,15 +92,11 @@ typedef struct upb_daemon_sinks {
     void *user;
     void (*column_stream)(void *user, uint64_t time_ns, const uint8_t *datagram, size_t bytes); /* upb_column_wire.h */
     void (*hdl64)(void *user, uint64_t time_ns, const uint8_t *packet, size_t bytes);           /* 1206 bytes */
-    void (*can)(void *user, uint64_t time_ns, uint32_t id, uint32_t flags, const uint8_t *data, uint32_t bytes);
-    void (*serial)(void *user, uint64_t time_ns, const uint8_t *data, size_t bytes);
+    upb_send (*can)(void *user, uint64_t time_ns, const upb_can_frame *frame);
+    upb_send (*serial)(void *user, uint64_t time_ns, const uint8_t *data, size_t bytes);
     void (*ledger)(void *user, const upb_ledger_record *record);
     void (*event)(void *user, const upb_event *event);
 } upb_daemon_sinks;
-
-/* `flags` of a CAN frame. */
-#define UPB_DAEMON_CAN_EXTENDED 1u /* 29-bit identifier */
-#define UPB_DAEMON_CAN_FD 2u
 
 /* ------------------------------------------------------------------------------------------------------ configuration
  */
@@ -129,15 +128,23 @@ typedef struct upb_daemon_config {
     uint64_t stale_ns;       /* a packet that waited longer is dropped */
 
     /* health: what sets and heals each fault is in docs/upbeamd.md */
-    uint64_t timeout_ns;             /* without a packet this long: SENSOR_TIMEOUT, and what is pending leaves */
-    uint32_t packets_per_second_max; /* above it: NET_FLOOD; 0: twice what the sensor sends */
-    uint64_t jitter_ns;              /* arrival against sensor time, of one packet to the next: NET_JITTER */
-    uint32_t drift_ppm;              /* sensor clock against ours: CLOCK_DRIFT */
-    uint32_t loss_permille;          /* firings inserted in a frame: NET_LOSS */
-    uint32_t throttle_permille;      /* service time against its baseline, 1500: half as long again: COMPUTE_THROTTLE */
-    uint32_t visibility_permille;    /* returns against their baseline, below it: SENSOR_VISIBILITY */
-    uint32_t crosstalk_permille;     /* returns that stand alone: SENSOR_CROSSTALK */
-    uint32_t integrity_bytes;        /* of the memory that must not change, checked at each frame's end */
+    uint64_t timeout_ns;          /* without a packet this long: SENSOR_TIMEOUT, and what is pending leaves */
+    uint32_t flood_per_second;    /* refused packets above it: NET_FLOOD; 0: as many as the sensor sends */
+    uint64_t jitter_ns;           /* arrival against sensor time, of one packet to the next: NET_JITTER */
+    uint32_t drift_ppm;           /* sensor clock against ours: CLOCK_DRIFT */
+    uint32_t loss_permille;       /* firings inserted in a frame: NET_LOSS */
+    uint32_t throttle_permille;   /* service time against its baseline, 1500: half as long again: COMPUTE_THROTTLE */
+    uint32_t visibility_permille; /* returns against their baseline, below it: SENSOR_VISIBILITY */
+    uint32_t crosstalk_permille;  /* returns that stand alone: SENSOR_CROSSTALK */
+    uint32_t integrity_bytes;     /* of the memory that must not change, checked at each frame's end */
+
+    /* buses */
+    const uint8_t *key;  /* UPB_KEY_BYTES for commands, copied; null: no command is taken */
+    upb_storage storage; /* of the bus: freshness and fault memory; functions may be null */
+    /* The model file with this CRC-32, for the command that asks for it; 0 if there is none. Bytes are copied. */
+    int (*find_model)(void *user, uint32_t crc32, const void **ubm, size_t *bytes);
+    int (*reset)(void *user, uint32_t type); /* upb_bus_config.reset */
+    void *user;                              /* of find_model and reset */
 
     /* memory */
     uint32_t ubm_bytes_max;   /* of a model file that may be loaded; two are kept */
@@ -184,8 +191,7 @@ void upb_daemon_position(upb_daemon *daemon, const uint8_t *data, size_t bytes, 
                          uint64_t received_ns);
 /* `packets` data packets were received and dropped before the step: its queue was full. */
 void upb_daemon_queue_full(upb_daemon *daemon, uint64_t packets, uint64_t now_ns);
-void upb_daemon_can(upb_daemon *daemon, uint32_t id, uint32_t flags, const uint8_t *data, uint32_t bytes,
-                    uint64_t received_ns);
+void upb_daemon_can(upb_daemon *daemon, const upb_can_frame *frame, uint64_t received_ns);
 void upb_daemon_serial(upb_daemon *daemon, const uint8_t *data, size_t bytes, uint64_t received_ns);
 /* Time passes: timeouts, cyclic messages. At least every 10 ms; never with a time before an earlier call's. */
 void upb_daemon_tick(upb_daemon *daemon, uint64_t now_ns);
@@ -236,7 +242,7 @@ typedef struct upb_daemon_status {
     upb_daemon_counters counters;
     uint64_t now_ns;
     uint64_t frame;       /* being received */
-    uint64_t faults;      /* bit n: upb_fault n is active */
+    uint64_t faults;      /* bit id - 1: the upb_fault is active */
     uint64_t faults_ever; /* since the start */
     uint64_t lag_ns, lag_max_ns;
     uint64_t last_latency_ns;
@@ -255,6 +261,10 @@ typedef struct upb_daemon_status {
 
 upb_daemon_status upb_daemon_get_status(const upb_daemon *daemon);
 const upb_ledger *upb_daemon_get_ledger(const upb_daemon *daemon);
+const upb_faults *upb_daemon_get_faults(const upb_daemon *daemon);
+/* The table of the HDL-64E that sinks.hdl64 shows, with azimuth_offset_mdeg for the speed in use; null before the
+ * stream begins. Drivers read it from the packets, or from the file that upb_packet tools write of it. */
+const upb_packet_calibration *upb_daemon_get_calibration(const upb_daemon *daemon);
 
 /* Virtual time: the work on a packet from now on. */
 void upb_daemon_set_service(upb_daemon *daemon, const uint64_t service_ns[UPB_MODES]);
