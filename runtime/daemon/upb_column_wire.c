@@ -23,9 +23,7 @@ static uint32_t get_u16(const uint8_t *at) { return (uint32_t)at[0] | (uint32_t)
 static uint32_t get_u32(const uint8_t *at) { return get_u16(at) | get_u16(at + 2) << 16; }
 static uint64_t get_u64(const uint8_t *at) { return get_u32(at) | (uint64_t)get_u32(at + 4) << 32; }
 
-size_t upb_wire_bytes(uint32_t columns) {
-    return UPB_WIRE_HEADER_BYTES + (size_t)columns * UPB_WIRE_COLUMN_BYTES;
-}
+size_t upb_wire_bytes(uint32_t columns) { return UPB_WIRE_HEADER_BYTES + (size_t)columns * UPB_WIRE_COLUMN_BYTES; }
 
 void upb_wire_write_header(const upb_wire_header *header, uint8_t *datagram) {
     memcpy(datagram, magic, sizeof magic);

@@ -98,8 +98,7 @@ typedef struct upb_daemon_sinks {
     void (*event)(void *user, const upb_event *event);
 } upb_daemon_sinks;
 
-/* ------------------------------------------------------------------------------------------------------ configuration
- */
+/* ------------------------------------------------------------------------------------------------ configuration */
 
 #define UPB_DAEMON_CUT_OF_MODEL UINT32_MAX
 
@@ -108,6 +107,7 @@ typedef struct upb_daemon_config {
 
     /* the sensor */
     uint32_t sensor;                   /* upb_sensor of packets.h: HDL-32E or VLP-32C */
+    uint32_t any_model;                /* 1: take a model made for another sensor */
     uint32_t source_ipv4;              /* take packets of this address only (host byte order); 0: of any */
     uint32_t rpm;                      /* nominal turns a minute; 0: measured when the stream begins */
     uint32_t rpm_tolerance_permille;   /* beyond it SENSOR_RPM_RANGE is set */
@@ -120,9 +120,8 @@ typedef struct upb_daemon_config {
     uint64_t deadline_ns;
 
     /* the degradation ladder: lag is when work on a packet begins minus when it was received */
-    uint64_t
-        ladder_down_ns[UPB_MODES - 1]; /* rising: at this lag the mode is at least VALID_MEAN, REPEAT, PASS_THROUGH */
-    uint64_t ladder_up_ns;             /* with the lag below this for ladder_hold_ns the mode goes up one rung */
+    uint64_t ladder_down_ns[UPB_MODES - 1]; /* rising: from this lag on VALID_MEAN, REPEAT, PASS_THROUGH at best */
+    uint64_t ladder_up_ns;                  /* with the lag below this for ladder_hold_ns the mode goes up one rung */
     uint64_t ladder_hold_ns; /* doubled, up to 16 times, while a climb is followed by a fall within twice the hold */
     uint32_t mode_floor;     /* upb_mode: never better than this */
     uint64_t stale_ns;       /* a packet that waited longer is dropped */
@@ -218,11 +217,13 @@ typedef struct upb_daemon_counters {
     uint64_t firings_processed; /* each became one column */
     uint64_t firings_inserted;  /* never arrived; each became one column of no return */
     uint64_t firings_skipped;   /* never arrived, in gaps too long to insert */
-    uint64_t columns_out;       /* = firings_processed + firings_inserted - pending */
+    uint64_t columns_out;       /* = firings_processed + firings_inserted - columns_lost - pending */
+    uint64_t columns_lost;      /* pending in a stream whose memory was damaged */
     uint64_t columns_by_mode[UPB_MODES];
     uint64_t column_datagrams;
     uint64_t hdl64_packets;
     uint64_t hdl64_beyond_range; /* returns beyond 131 m: not in HDL-64E packets */
+    uint64_t hdl64_padding;      /* empty firings that filled a packet where the stream ended */
     uint64_t second_returns;     /* firings whose other return passed through */
     uint64_t frames_closed, frames_missed, frames_partial;
     uint64_t frames_forced;  /* cut though the azimuth did not pass the cut */

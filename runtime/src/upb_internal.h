@@ -37,6 +37,9 @@ int32_t upb_offset_columns(int32_t offset_udeg, uint32_t columns);
 /* CRC-32 (CRC-32/ISO-HDLC) of bytes that follow others whose CRC is `crc`; 0 to begin. */
 uint32_t upb_crc32(uint32_t crc, const void *bytes, size_t size);
 
+/* For tests: a number of the stream whose damage shows in upb_stream_checksum and nowhere else. */
+uint32_t *upb_stream_test_constant(upb_stream *stream);
+
 /*
  * The generated rows of one column in every mode but NETWORK. distance, intensity: [UPB_BEAMS] of the sensor;
  * out_*: [UPB_LANES], of which lane UPB_WINDOWS has no meaning.

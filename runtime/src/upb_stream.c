@@ -337,6 +337,8 @@ upb_status upb_stream_checksum(const upb_stream *stream, uint32_t *checksum) {
     return UPB_OK;
 }
 
+uint32_t *upb_stream_test_constant(upb_stream *stream) { return &stream->reorder_columns; }
+
 /* -------------------------------------------------------------------------------------- azimuth columns */
 
 static void prepare(const upb_stream *s, upb_prepared *prepared, const uint16_t *distance, const uint8_t *intensity) {
