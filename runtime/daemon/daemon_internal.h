@@ -205,7 +205,7 @@ struct upb_daemon {
     upb_packet_encoder encoder;
     upb_packet_calibration calibration;
     uint32_t encoder_made;
-    uint32_t calibration_rpm_milli;
+    uint32_t calibration_columns; /* per turn, that `calibration` is for */
     uint32_t hdl64_azimuth_mdeg; /* of the last column in the encoder */
     uint64_t hdl64_time_ns;
     uint64_t closing; /* frame whose last column waits in the encoder */

@@ -81,7 +81,7 @@ static void make_calibration(upb_daemon *d) {
     int32_t elevation_mdeg[UPB_ROWS];
     for (unsigned row = 0; row < UPB_ROWS; row++)
         elevation_mdeg[row] = (info->row_elevation_udeg[row] + (info->row_elevation_udeg[row] < 0 ? -500 : 500)) / 1000;
-    if (upb_packet_calibration_rows(elevation_mdeg, d->calibration_rpm_milli, &d->calibration) != UPB_PACKET_OK)
+    if (upb_packet_calibration_rows(elevation_mdeg, d->calibration_columns, &d->calibration) != UPB_PACKET_OK)
         return;
     for (unsigned row = 0; row < UPB_ROWS; row++) {
         const unsigned k = row / 2, below = row + 1 < UPB_ROWS && row % 2 ? k + 1 : k;
@@ -134,12 +134,9 @@ void daemon_output_begin(upb_daemon *d) {
     d->wire_header.model_crc32 = info->crc32;
     d->wire_header.distance_unit_um = info->distance_unit_um;
     d->wire_header.turn_columns = d->columns;
-    /* Thousandths of a turn a minute. Decoders reckon with an HDL-64E's own firing cycle. */
-    const uint64_t ns_per_turn = (uint64_t)d->columns * upb_sensor_info_get(UPB_SENSOR_HDL_64E_S3)->firing_cycle_ns;
-    const uint32_t rpm_milli = (uint32_t)(UINT64_C(60000) * NS_PER_S / ns_per_turn);
-    if (d->encoder_made && rpm_milli == d->calibration_rpm_milli)
+    if (d->encoder_made && d->columns == d->calibration_columns)
         return;
-    d->calibration_rpm_milli = rpm_milli;
+    d->calibration_columns = d->columns;
     make_calibration(d);
     if (d->encoder_made) {
         upb_packet_encoder_set_record(&d->encoder, &d->calibration);
