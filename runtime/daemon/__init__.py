@@ -24,6 +24,7 @@ __all__ = [
     "HDL_32E",
     "MODES",
     "REGIONS",
+    "UPBEAMD",
     "VERDICTS",
     "VLP_32C",
     "CanFrame",
@@ -39,6 +40,8 @@ __all__ = [
     "read_columns",
 ]
 
+UPBEAMD: Path = Path(_daemon.__file__).with_name("upbeamd")
+"""The process, built with the package (on Linux)."""
 HDL_32E, VLP_32C = 1, 2
 """Values of the setting ``sensor``: ``upb_sensor`` of packets.h."""
 MODES = ("network", "valid_mean", "repeat", "pass_through")
