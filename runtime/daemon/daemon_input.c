@@ -159,8 +159,8 @@ static void refuse(upb_daemon *d, uint32_t drop, uint64_t received_ns) {
     health *h = &d->health;
     d->counters.packets_dropped[drop]++;
     h->now.refused[drop]++;
-    if (drop == UPB_DROP_QUEUE || drop == UPB_DROP_STALE || drop == UPB_DROP_ENDED)
-        return; /* none of the sender's doing */
+    if (drop == UPB_DROP_QUEUE || drop == UPB_DROP_STALE || drop == UPB_DROP_STUCK || drop == UPB_DROP_ENDED)
+        return; /* what the sensor sends, no more than it */
     if (received_ns - h->flood_window_ns >= FLOOD_WINDOW_NS) {
         h->flood_window_ns = received_ns;
         h->flood_count = 0;
@@ -281,6 +281,10 @@ void upb_daemon_packet(upb_daemon *d, const uint8_t *data, size_t bytes, uint32_
     uint32_t drop = judge(d, data, bytes, source_ipv4, received_ns, &info);
     if (drop == UPB_DROPS && virtual_queue_is_full(d, received_ns))
         drop = UPB_DROP_QUEUE;
+    if (drop == UPB_DROP_STUCK) { /* the sensor is there; what it measured before it stood still leaves */
+        d->heard_ns = daemon_now(d);
+        daemon_end_segment(d, 1);
+    }
     if (drop != UPB_DROPS) {
         refuse(d, drop, received_ns);
         return;

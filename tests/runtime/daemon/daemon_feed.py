@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,15 @@ def model_file(sensor: str = "hdl-32e") -> bytes:
     return (MODELS / f"{sensor}.ubm").read_bytes()
 
 
-@dataclass
+@dataclass(frozen=True)
 class Packet:
     time_ns: int
     """The sensor's clock when its last firing was done: when it is sent."""
     data: bytes
+
+
+_MADE: dict[Any, tuple[list[Packet], Firings | None]] = {}
+"""Feeds that were made: many tests use the same."""
 
 
 @dataclass
@@ -59,6 +64,14 @@ class Feed:
         return counts.astype(np.uint16), np.where(counts > 0, 40 + beam, 0).astype(np.uint8)
 
     def make(self, turns: float) -> list[Packet]:
+        """Packets of so many turns; ``firings`` are then what they hold."""
+        key = (self.sensor, self.rpm, self.dual, self.start_deg, self.start_ns, self.seed, self.noise, turns)
+        if key not in _MADE:
+            _MADE[key] = (self._make(turns), self.firings)
+        packets, self.firings = _MADE[key]
+        return list(packets)
+
+    def _make(self, turns: float) -> list[Packet]:
         per_packet = sensor_info(self.sensor).packet_firings // (2 if self.dual else 1)
         count = int(turns * self.columns) // per_packet * per_packet
         n = np.arange(count)

@@ -59,13 +59,14 @@ def changes(events: list[dict[str, Any]]) -> list[tuple[str, str]]:
 
 
 def test_down_under_load_and_up_again() -> None:
-    packets = Feed().make(20)
+    packets = Feed().make(40)
     daemon = overloaded()
-    run(daemon, packets[:1500])
+    run(daemon, packets[:150])
     assert daemon.mode == "pass_through"
+    run(daemon, packets[150:900])
     assert "COMPUTE_OVERLOAD" in daemon.faults
     daemon.set_service(LIGHT)
-    last = run(daemon, packets[1500:])
+    last = run(daemon, packets[900:])
     assert daemon.mode == "network"
     out = finish(daemon, last)
     steps = changes(out.events)
