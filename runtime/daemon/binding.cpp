@@ -89,6 +89,8 @@ constexpr Field fields[] = {
     FIELD(rpm),
     FIELD(rpm_tolerance_permille),
     FIELD(cut_mdeg),
+    FIELD(fov_begin_mdeg),
+    FIELD(fov_end_mdeg),
     FIELD(width_tolerance_permille),
     FIELD(precision),
     FIELD(cpu),

@@ -135,12 +135,8 @@ static void take_into_sequence(upb_daemon *d, const upb_packet_info *info, uint6
     packet_sequence *s = &d->sequence;
     const int64_t after = s->taken_count ? after_us(s->time_us, info->time_us) : 0;
     const uint64_t elapsed_ns = received_ns - s->received_ns;
-    if (s->taken_count && after > 0) {
-        const int64_t jitter = (int64_t)elapsed_ns - after * (int64_t)NS_PER_US;
-        const uint64_t size = (uint64_t)(jitter < 0 ? -jitter : jitter);
-        if (size > d->health.now.jitter_ns)
-            d->health.now.jitter_ns = size;
-    }
+    const int64_t jitter = (int64_t)elapsed_ns - after * (int64_t)NS_PER_US;
+    s->jitter_ns = s->taken_count && after > 0 ? (uint64_t)(jitter < 0 ? -jitter : jitter) : 0;
     if (after > 0 || !s->taken_count) {
         s->sensor_ns += (uint64_t)after * NS_PER_US;
         s->time_us = info->time_us;
@@ -306,8 +302,12 @@ void upb_daemon_packet(upb_daemon *d, const uint8_t *data, size_t bytes, uint32_
         return;
     }
     d->counters.packets_processed++;
+    const uint32_t fov_break = d->fov_break;
     daemon_report(d, UPB_FAULT_SENSOR_TIMEOUT, UPB_MONITOR_PASSED, 0);
     work(d, firings, count, received_ns, begin_ns);
+    /* A packet that spans the blind part of a turn is sent late, and the next one's time says so. */
+    if (!fov_break && !d->fov_break && d->sequence.jitter_ns > d->health.now.jitter_ns)
+        d->health.now.jitter_ns = d->sequence.jitter_ns;
     daemon_bus_step(d, daemon_now(d));
 }
 

@@ -76,6 +76,7 @@ typedef struct packet_sequence {
     int64_t drift_offset_ns; /* of the window before, for the drift */
     uint64_t drift_at_ns;
     uint32_t drift_windows;
+    uint64_t jitter_ns;    /* of the packet at hand */
     uint32_t candidate_us; /* a packet outside the sequence that others may confirm */
     uint32_t candidate_count;
     struct {
@@ -190,6 +191,8 @@ struct upb_daemon {
     uint64_t pushed, out, segment;    /* numbers of firings: next in, next out, first of the segment */
     uint32_t ending;                  /* the stream is being flushed */
     int64_t last_angle_mdeg;
+    uint32_t last_azimuth_mdeg;
+    uint32_t fov_break; /* firings for which the clock may still jump: the blind part of the turn has just passed */
     uint64_t last_time_ns;
     uint64_t frame_base, frame; /* number of the tracker's frame 0; of the last firing */
     uint32_t frame_column;      /* next in the frame */
@@ -206,7 +209,7 @@ struct upb_daemon {
     upb_packet_calibration calibration;
     uint32_t encoder_made;
     uint32_t calibration_columns; /* per turn, that `calibration` is for */
-    uint32_t hdl64_azimuth_mdeg; /* of the last column in the encoder */
+    uint32_t hdl64_azimuth_mdeg;  /* of the last column in the encoder */
     uint64_t hdl64_time_ns;
     uint64_t closing; /* frame whose last column waits in the encoder */
     uint32_t closing_set;

@@ -7,6 +7,8 @@
 #include "daemon_internal.h"
 #include "upb_internal.h"
 
+enum { FOV_MARGIN_MDEG = 3000 };
+
 _Static_assert((FIRINGS_KEPT & (FIRINGS_KEPT - 1)) == 0, "notes are found by masking");
 
 static firing_note *note_of(upb_daemon *d, uint64_t number) { return &d->notes[number & (FIRINGS_KEPT - 1u)]; }
@@ -207,22 +209,7 @@ void daemon_forget_turn(upb_daemon *d) {
 
 static int is_a_turn(uint32_t columns) { return columns >= TURN_COLUMNS_MIN && columns <= TURN_COLUMNS_MAX; }
 
-/* Columns of a turn for a segment that begins with `firing`: as configured, as tracked, as its packet tells. */
-static uint32_t first_columns(const upb_daemon *d, const upb_firing *firing) {
-    const uint32_t tracked = upb_azimuth_turn_firings(&d->tracker);
-    if (!d->config.rpm && is_a_turn(tracked))
-        return tracked;
-    const uint64_t rate = d->config.rpm         ? (uint64_t)d->config.rpm * 6000
-                          : firing->rate_mdeg_s ? firing->rate_mdeg_s
-                                                : UINT64_C(3600000);
-    const uint64_t per_turn = (uint64_t)UPB_FULL_TURN_MDEG * NS_PER_S, step = rate * d->cycle_ns;
-    const uint64_t columns = (per_turn + step / 2) / step;
-    return columns < TURN_COLUMNS_MIN   ? TURN_COLUMNS_MIN
-           : columns > TURN_COLUMNS_MAX ? TURN_COLUMNS_MAX
-                                        : (uint32_t)columns;
-}
-
-/* At a frame boundary: does the speed ask for another stream? Only if a beam's offset would change its column. */
+/* Does the speed ask for another stream? Only if a beam's offset would change its column. */
 static uint32_t wanted_columns(upb_daemon *d) {
     const uint32_t measured = upb_azimuth_turn_firings(&d->tracker);
     int32_t offset[UPB_BEAMS], shift;
@@ -233,6 +220,20 @@ static uint32_t wanted_columns(upb_daemon *d) {
         return d->columns;
     plan_offsets(d, measured, offset, &shift);
     return memcmp(offset, d->offset, sizeof offset) == 0 ? d->columns : measured;
+}
+
+/* Columns of a turn for a segment that begins with `firing`: as before, as configured, as its packet tells. */
+static uint32_t first_columns(upb_daemon *d, const upb_firing *firing) {
+    if (d->columns)
+        return wanted_columns(d);
+    const uint64_t rate = d->config.rpm         ? (uint64_t)d->config.rpm * 6000
+                          : firing->rate_mdeg_s ? firing->rate_mdeg_s
+                                                : UINT64_C(3600000);
+    const uint64_t per_turn = (uint64_t)UPB_FULL_TURN_MDEG * NS_PER_S, step = rate * d->cycle_ns;
+    const uint64_t columns = (per_turn + step / 2) / step;
+    return columns < TURN_COLUMNS_MIN   ? TURN_COLUMNS_MIN
+           : columns > TURN_COLUMNS_MAX ? TURN_COLUMNS_MAX
+                                        : (uint32_t)columns;
 }
 
 /* Between two segments only. */
@@ -262,7 +263,7 @@ static void enter_frame(upb_daemon *d, uint64_t frame, int begins_late) {
     if (d->frame_open && frame == d->frame)
         return;
     if (d->frame_open) {
-        daemon_health_look(d, !begins_late);
+        daemon_health_look(d, !frame_of(d, d->frame)->partial);
         at_frame_boundary(d);
     }
     open_new_frame(d, frame, begins_late);
@@ -306,19 +307,49 @@ static void insert_missing(upb_daemon *d, const upb_step *step, uint64_t time_ns
     daemon_event(d, UPB_EVENT_GAP, step->missing, 0, 0);
 }
 
-/* Is the firing so far from the last one that nothing is to be put between? Ends the segment then. */
-static void breaks_off(upb_daemon *d, const upb_firing *firing, const upb_step *step) {
-    const int jumped = (firing->flags & UPB_FIRING_JUMP) || (step->flags & UPB_STEP_TIME_JUMP);
-    const int restarted = (step->flags & UPB_STEP_RESTART) != 0, too_long = step->missing > d->columns;
-    if (jumped) {
-        d->health.now.jumps_azimuth++;
-        daemon_report(d, UPB_FAULT_SENSOR_AZIMUTH_JUMP, UPB_MONITOR_FAILED, firing->azimuth_mdeg);
+static int is_near(uint32_t azimuth_mdeg, uint32_t mark_mdeg) {
+    const uint32_t apart = azimuth_mdeg > mark_mdeg ? azimuth_mdeg - mark_mdeg : mark_mdeg - azimuth_mdeg;
+    return apart < FOV_MARGIN_MDEG || apart > UPB_FULL_TURN_MDEG - FOV_MARGIN_MDEG;
+}
+
+/* From the end of a limited field of view to its begin: nothing was to come between. */
+static int is_blind_part(const upb_daemon *d, const upb_firing *firing) {
+    const upb_daemon_config *c = &d->config;
+    return c->fov_begin_mdeg != c->fov_end_mdeg && is_near(d->last_azimuth_mdeg, c->fov_end_mdeg) &&
+           is_near(firing->azimuth_mdeg, c->fov_begin_mdeg);
+}
+
+static void note_jump(upb_daemon *d, upb_fault fault, uint32_t *count, uint64_t value) {
+    ++*count;
+    daemon_report(d, fault, UPB_MONITOR_FAILED, value);
+}
+
+/* How a firing follows the last one. */
+typedef enum transition {
+    FOLLOWS,   /* with firings to insert between, if some are missing */
+    NEW_TURN,  /* the blind part of a limited field of view lies between */
+    BROKEN_OFF /* what lies between is unknown, or too much to be inserted */
+} transition;
+
+static transition transition_to(upb_daemon *d, const upb_firing *firing, const upb_step *step) {
+    const int clock = (step->flags & UPB_STEP_TIME_JUMP) != 0;
+    const int jumped = (firing->flags & UPB_FIRING_JUMP) || (clock && step->missing);
+    if ((jumped || step->missing) && is_blind_part(d, firing)) {
+        d->fov_break = 2 * d->packet_firings;
+        return NEW_TURN;
     }
-    if (!(jumped || restarted || too_long) || !daemon_reacts(d, REACT_RESYNC))
-        return;
+    if (d->fov_break)
+        d->fov_break--;
+    else if (clock && !jumped) /* the azimuth goes on as if nothing were */
+        note_jump(d, UPB_FAULT_SENSOR_TIME_JUMP, &d->health.now.jumps_time, firing->azimuth_mdeg);
+    if (jumped)
+        note_jump(d, UPB_FAULT_SENSOR_AZIMUTH_JUMP, &d->health.now.jumps_azimuth, firing->azimuth_mdeg);
+    const int broken = jumped || (step->flags & UPB_STEP_RESTART) || step->missing > d->columns;
+    if (!broken || !daemon_reacts(d, REACT_RESYNC))
+        return FOLLOWS;
     d->counters.resyncs++;
     daemon_event(d, UPB_EVENT_RESYNC, jumped ? UPB_FAULT_SENSOR_AZIMUTH_JUMP : UPB_FAULT_NET_LOSS, 0, step->missing);
-    daemon_end_segment(d, 1);
+    return BROKEN_OFF;
 }
 
 static void watch_stuck(upb_daemon *d, const upb_step *step, const upb_firing *firing) {
@@ -371,11 +402,14 @@ void daemon_take_firing(upb_daemon *d, const upb_firing *firing, const upb_firin
     if (step.rpm_milli)
         d->rpm_milli = step.rpm_milli;
     watch_stuck(d, &step, firing);
-    if (d->stream)
-        breaks_off(d, firing, &step);
+    const transition how = d->stream ? transition_to(d, firing, &step) : BROKEN_OFF;
+    if (how == NEW_TURN)
+        daemon_health_look(d, !frame_of(d, d->frame)->partial);
+    if (how != FOLLOWS)
+        daemon_end_segment(d, how == BROKEN_OFF);
     const int new_segment = d->stream == NULL;
     if (new_segment) {
-        if (!(step.flags & UPB_STEP_TIME_JUMP))
+        if (how == BROKEN_OFF && !(step.flags & UPB_STEP_TIME_JUMP))
             d->counters.firings_skipped += step.missing;
         use_pending_model(d);
         daemon_begin_stream(d, first_columns(d, firing));
@@ -383,9 +417,10 @@ void daemon_take_firing(upb_daemon *d, const upb_firing *firing, const upb_firin
             return;
     } else if (step.missing && daemon_reacts(d, REACT_GAP))
         insert_missing(d, &step, firing->time_ns);
-    enter_frame(d, number_of(d, &step, new_segment), new_segment);
+    enter_frame(d, number_of(d, &step, new_segment), new_segment && how == BROKEN_OFF);
     push(d, firing, second, received_ns);
     daemon_health_firing(d, firing);
     d->last_angle_mdeg = step.angle_mdeg;
+    d->last_azimuth_mdeg = firing->azimuth_mdeg;
     d->last_time_ns = firing->time_ns;
 }

@@ -104,6 +104,8 @@ static upb_status check_config(const upb_daemon_config *c, upb_error *error) {
         {"rpm", c->rpm, 0, 1500},
         {"rpm_tolerance_permille", c->rpm_tolerance_permille, 0, 1000},
         {"cut_mdeg", c->cut_mdeg == UPB_DAEMON_CUT_OF_MODEL ? 0 : c->cut_mdeg, 0, UPB_FULL_TURN_MDEG - 1},
+        {"fov_begin_mdeg", c->fov_begin_mdeg, 0, UPB_FULL_TURN_MDEG - 1},
+        {"fov_end_mdeg", c->fov_end_mdeg, 0, UPB_FULL_TURN_MDEG - 1},
         {"width_tolerance_permille", c->width_tolerance_permille, 0, 1000},
         {"precision", c->precision, 0, UPB_PRECISION_INT8},
         {"cpu", c->cpu, 0, UPB_CPU_NEON_DOT},
@@ -199,9 +201,19 @@ static void take_layout(upb_daemon *d, uint8_t *memory, const layout *l) {
     d->notes = (firing_note *)(void *)(memory + l->notes);
 }
 
+static uint32_t cut_of(const upb_daemon *d) {
+    const upb_daemon_config *c = &d->config;
+    if (c->cut_mdeg != UPB_DAEMON_CUT_OF_MODEL)
+        return c->cut_mdeg;
+    if (c->fov_begin_mdeg == c->fov_end_mdeg)
+        return d->slot[0].info.cut_mdeg;
+    const uint32_t blind = (c->fov_begin_mdeg + UPB_FULL_TURN_MDEG - c->fov_end_mdeg) % UPB_FULL_TURN_MDEG;
+    return (c->fov_end_mdeg + blind / 2) % UPB_FULL_TURN_MDEG;
+}
+
 static upb_status init_parts(upb_daemon *d, upb_ledger_record *records, upb_error *error) {
     const upb_sensor_info *sensor = upb_sensor_info_get((upb_sensor)d->config.sensor);
-    const uint32_t cut = d->config.cut_mdeg == UPB_DAEMON_CUT_OF_MODEL ? d->slot[0].info.cut_mdeg : d->config.cut_mdeg;
+    const uint32_t cut = cut_of(d);
     d->cycle_ns = sensor->firing_cycle_ns;
     d->packet_firings = sensor->packet_firings;
     upb_packet_decoder_config decoder = upb_packet_decoder_config_default();

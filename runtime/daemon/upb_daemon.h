@@ -106,12 +106,14 @@ typedef struct upb_daemon_config {
     uint32_t struct_bytes; /* sizeof(upb_daemon_config), set by upb_daemon_config_default */
 
     /* the sensor */
-    uint32_t sensor;                   /* upb_sensor of packets.h: HDL-32E or VLP-32C */
-    uint32_t any_model;                /* 1: take a model made for another sensor */
-    uint32_t source_ipv4;              /* take packets of this address only (host byte order); 0: of any */
-    uint32_t rpm;                      /* nominal turns a minute; 0: measured when the stream begins */
-    uint32_t rpm_tolerance_permille;   /* beyond it SENSOR_RPM_RANGE is set */
-    uint32_t cut_mdeg;                 /* frames begin here; UPB_DAEMON_CUT_OF_MODEL */
+    uint32_t sensor;                 /* upb_sensor of packets.h: HDL-32E or VLP-32C */
+    uint32_t any_model;              /* 1: take a model made for another sensor */
+    uint32_t source_ipv4;            /* take packets of this address only (host byte order); 0: of any */
+    uint32_t rpm;                    /* nominal turns a minute; 0: measured when the stream begins */
+    uint32_t rpm_tolerance_permille; /* beyond it SENSOR_RPM_RANGE is set */
+    uint32_t cut_mdeg; /* frames begin here; UPB_DAEMON_CUT_OF_MODEL: the model's, or behind a limited field of view */
+    /* A sensor told to fire in a part of the turn only, clockwise from begin to end. Equal: the whole turn. */
+    uint32_t fov_begin_mdeg, fov_end_mdeg;
     uint32_t width_tolerance_permille; /* the stream is made anew at a frame boundary when the speed has changed more */
 
     /* computing */
