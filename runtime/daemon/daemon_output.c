@@ -32,12 +32,12 @@ static void add_to_wire(upb_daemon *d, const upb_wire_column *column, uint64_t f
 static void encode(upb_daemon *d, const upb_firing *firing) {
     uint8_t packet[UPB_PACKET_BYTES];
     uint32_t ready = 0;
-    const uint64_t too_far = d->encoder.stats.too_far;
-    if (upb_packet_encode(&d->encoder, firing, packet, &ready) != UPB_PACKET_OK || !ready)
+    const upb_packet_status status = upb_packet_encode(&d->encoder, firing, packet, &ready);
+    d->counters.hdl64_beyond_range = d->encoder.stats.too_far;
+    if (status != UPB_PACKET_OK || !ready)
         return;
     d->counters.hdl64_packets++;
     d->config.sinks.hdl64(d->config.sinks.user, daemon_now(d), packet, sizeof packet);
-    d->counters.hdl64_beyond_range += d->encoder.stats.too_far - too_far;
 }
 
 static void add_to_hdl64(upb_daemon *d, const upb_wire_column *column) {
@@ -85,7 +85,9 @@ static void make_calibration(upb_daemon *d) {
         return;
     for (unsigned row = 0; row < UPB_ROWS; row++) {
         const unsigned k = row / 2, below = row + 1 < UPB_ROWS && row % 2 ? k + 1 : k;
-        d->calibration.laser[row].azimuth_offset_mdeg += (residual_mdeg(d, k) + residual_mdeg(d, below)) / 2;
+        const int32_t residual = residual_mdeg(d, k) + residual_mdeg(d, below); /* twice it */
+        /* In whole steps of the record, so that it adds no rounding to the table's own. */
+        d->calibration.laser[row].azimuth_offset_mdeg += (residual + (residual < 0 ? -10 : 10)) / 20 * 10;
     }
 }
 

@@ -282,8 +282,16 @@ upb_status upb_daemon_set_floor(upb_daemon *d, upb_mode mode, uint64_t now_ns) {
     return UPB_OK;
 }
 
+/* How long a sensor with a limited field of view is silent each turn. */
+static uint64_t blind_ns(const upb_daemon *d) {
+    const upb_daemon_config *c = &d->config;
+    const uint64_t blind = (c->fov_begin_mdeg + UPB_FULL_TURN_MDEG - c->fov_end_mdeg) % UPB_FULL_TURN_MDEG;
+    const uint64_t rpm_milli = d->rpm_milli ? d->rpm_milli : 300000;
+    return blind * 60 * (NS_PER_S / UPB_FULL_TURN_MDEG) * 1000 / rpm_milli;
+}
+
 static void watch_silence(upb_daemon *d, uint64_t now_ns) {
-    if (d->ended || now_ns < d->heard_ns || now_ns - d->heard_ns < d->config.timeout_ns)
+    if (d->ended || now_ns < d->heard_ns || now_ns - d->heard_ns < d->config.timeout_ns + blind_ns(d))
         return;
     daemon_report(d, UPB_FAULT_SENSOR_TIMEOUT, UPB_MONITOR_FAILED, now_ns - d->heard_ns);
     if (!daemon_detects(d, UPB_FAULT_SENSOR_TIMEOUT) || d->sensor_silent)
