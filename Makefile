@@ -106,6 +106,7 @@ soak: test-c $(VENV)/.dev
 	build/c/tests/runtime/c/test_stream --count 20000
 	build/c/runtime/bus/tests/test_bus_fuzz --count 2000000
 	build/c/tests/runtime/packets/fuzz_packets --count 10000000
+	build/c/runtime/daemon/test_daemon --count 10000000
 	$(BIN)/upbeam stream --frames 12000 --report build/soak
 
 dist: $(VENV)/.dev
@@ -121,6 +122,8 @@ stubs: $(VENV)/.installed
 	$(BIN)/python -m nanobind.stubgen -m upbeam.runtime.bus._bus -o runtime/bus/_bus.pyi
 	$(BIN)/ruff check --quiet --select I --fix runtime/bus/_bus.pyi && $(BIN)/ruff format --quiet runtime/bus/_bus.pyi
 	$(BIN)/python -m nanobind.stubgen -m upbeam.runtime.packets._packets -o runtime/packets/_packets.pyi
+	$(BIN)/python -m nanobind.stubgen -m upbeam.runtime.daemon._daemon -o runtime/daemon/_daemon.pyi
+	$(BIN)/ruff check --quiet --fix runtime/daemon/_daemon.pyi && $(BIN)/ruff format --quiet runtime/daemon/_daemon.pyi
 
 clean:
 	rm -rf $(VENV) build dist

@@ -20,6 +20,7 @@ from upbeam.model.rules import BEAMS
 from ._native import LiveConfig as NativeConfig
 from ._native import LiveRun as NativeRun
 from ._native import live_explains
+from .ladder import LADDER
 from .upsampler import CPUS, PRECISIONS, Model, need_precision
 
 __all__ = [
@@ -38,7 +39,7 @@ U16 = NDArray[np.uint16]
 U8 = NDArray[np.uint8]
 
 VERDICTS = ("met", "missed", "partial")
-MODES = ("network",)
+MODES = LADDER
 _WAITS = ("block", "poll")
 _CHOICES = {"clock": ("real", "virtual"), "precision": PRECISIONS, "cpu": CPUS, "wait": _WAITS}
 _POLL_S = 0.1

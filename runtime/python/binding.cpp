@@ -62,9 +62,10 @@ namespace {
 using DistanceIn = nb::ndarray<const uint16_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using IntensityIn = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
-// In the order of upb_cpu and of upb_precision.
+// In the order of upb_cpu, of upb_precision, of upb_mode.
 constexpr const char *cpu_names[] = {"auto", "scalar", "avx2", "avx512", "neon", "avx512-vnni", "neon-dot"};
 constexpr const char *precision_names[] = {"fp32", "int16", "int8"};
+constexpr const char *mode_names[] = {"network", "valid_mean", "repeat", "pass_through"};
 
 template <size_t N> uint32_t index_of(const char *const (&names)[N], const std::string &name, const char *what) {
     std::string expected;
@@ -181,6 +182,11 @@ class StreamHandle {
     void reset() {
         std::lock_guard<std::mutex> lock(mutex_);
         check(upb_stream_reset(stream_));
+    }
+
+    void set_mode(const std::string &mode) {
+        std::lock_guard<std::mutex> lock(mutex_);
+        check(upb_stream_set_mode(stream_, static_cast<upb_mode>(index_of(mode_names, mode, "mode"))));
     }
 
     nb::dict stats() {
@@ -397,6 +403,7 @@ NB_MODULE(_native, m) {
         .def("push", &StreamHandle::push, "distance"_a, "intensity"_a, "column"_a)
         .def("gap", &StreamHandle::gap, "columns"_a)
         .def("flush", &StreamHandle::flush)
+        .def("set_mode", &StreamHandle::set_mode, "mode"_a, "How generated rows are made from the next column on.")
         .def("reset", &StreamHandle::reset)
         .def("stats", &StreamHandle::stats);
     m.def("raw_windows", &raw_windows, "model"_a, "distance"_a, "intensity"_a, "cpu"_a = "auto",

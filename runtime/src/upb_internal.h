@@ -41,10 +41,10 @@ uint32_t upb_crc32(uint32_t crc, const void *bytes, size_t size);
 uint32_t *upb_stream_test_constant(upb_stream *stream);
 
 /*
- * The generated rows of one column in every mode but NETWORK. distance, intensity: [UPB_BEAMS] of the sensor;
- * out_*: [UPB_LANES], of which lane UPB_WINDOWS has no meaning.
+ * The generated rows of one column in every mode but NETWORK. limits: of the model, those alone are used; distance,
+ * intensity: [UPB_BEAMS] of the sensor; out_*: [UPB_LANES], of which lane UPB_WINDOWS has no meaning.
  */
-void upb_ladder_column(const upb_model_info *info, upb_mode mode, const uint16_t *distance, const uint8_t *intensity,
+void upb_ladder_column(const upb_model_int *limits, upb_mode mode, const uint16_t *distance, const uint8_t *intensity,
                        uint16_t *out_distance, uint8_t *out_intensity);
 
 #endif /* UPB_INTERNAL_H */

@@ -359,7 +359,7 @@ static void prepare_collected(const upb_stream *s, upb_prepared *prepared, const
 
 static void make_windows(const upb_stream *s, const upb_prepared *right, uint16_t *distance, uint8_t *intensity) {
     if (s->mode != UPB_MODE_NETWORK)
-        upb_ladder_column(&s->model->info, s->mode, s->own_distance, s->own_intensity, distance, intensity);
+        upb_ladder_column(&s->model->integer[0], s->mode, s->own_distance, s->own_intensity, distance, intensity);
     else if (s->integer)
         s->windows_int(s->integer, s->left, s->middle, right, distance, intensity);
     else

@@ -79,9 +79,7 @@ class Feed:
         mdeg = np.round(azimuth % 360.0 * 100).astype(np.int64) % 36000 * 10
         times = self.start_ns + n * self.cycle_ns
         distance, intensity = self.scene(azimuth)
-        primary = Firings.of(
-            distance, intensity, azimuth_mdeg=mdeg, time_ns=times, flags=DUAL if self.dual else 0
-        )
+        primary = Firings.of(distance, intensity, azimuth_mdeg=mdeg, time_ns=times, flags=DUAL if self.dual else 0)
         self.firings = primary
         encoder = Encoder(self.sensor, return_mode="dual" if self.dual else "strongest")
         packets = encoder.encode(self._with_seconds(primary) if self.dual else primary)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from daemon_feed import MODELS, MS, Feed, finish, model_file, run
+from daemon_feed import MODELS, Feed, finish, model_file, run
 
 from upbeam.runtime.daemon import REGIONS, Daemon, DaemonError, check_names, default_settings, read_columns
 
@@ -179,7 +179,7 @@ def test_impossible_settings_are_refused_by_name() -> None:
     }.items():
         with pytest.raises(DaemonError, match=name):
             Daemon(model_file(), {name: value})
-    with pytest.raises(DaemonError, match="SENS.name"):
+    with pytest.raises(DaemonError, match=r"SENS\.name"):
         Daemon(model_file("vlp-32c"))
     with pytest.raises(DaemonError, match="nonsense"):
         Daemon(model_file(), {"nonsense": 1})

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_feed import MS, Feed, Packet, finish, model_file, position, run
+from daemon_feed import MS, Feed, Packet, finish, model_file, position
 
-from upbeam.runtime.daemon import REGIONS, Daemon, DaemonError, check_names, read_columns
+from upbeam.runtime.daemon import Daemon
 
 Damage = Callable[["Bench"], None]
 TURN_MS = 100

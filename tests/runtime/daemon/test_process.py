@@ -40,6 +40,10 @@ def free_port() -> int:
         return int(sock.getsockname()[1])
 
 
+def endpoint(sock: socket.socket) -> str:
+    return f"127.0.0.1:{sock.getsockname()[1]}"
+
+
 def read_all(sock: socket.socket) -> list[bytes]:
     got = []
     while True:
@@ -112,9 +116,9 @@ def running(folder: Path, **settings: Any) -> Iterator[Running]:
         "model": model,
         "listen": f"127.0.0.1:{port}",
         "position_listen": f"127.0.0.1:{position_port}",
-        "columns": "127.0.0.1:%d" % columns.getsockname()[1],
-        "hdl64": "127.0.0.1:%d" % hdl64.getsockname()[1],
-        "can": "udp:%d:127.0.0.1:%d" % (can_port, can.getsockname()[1]),
+        "columns": endpoint(columns),
+        "hdl64": endpoint(hdl64),
+        "can": f"udp:{can_port}:{endpoint(can)}",
         "serial": os.ttyname(slave),
         "json": folder / "status.json",
         "json_ms": 50,
