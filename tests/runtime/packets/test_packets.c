@@ -439,6 +439,38 @@ static void test_record_stream(upb_sensor sensor, random_source *random) {
     CHECK(memcmp(&decoder.calibration, &unit, sizeof unit) == 0);
 }
 
+/* A new table begins the cycle and the record anew. */
+static void test_set_record(random_source *random) {
+    const upb_packet_calibration unit = random_unit(UPB_SENSOR_HDL_64E_S3, random);
+    upb_packet_encoder encoder = encoder_of(UPB_SENSOR_HDL_64E_S3, UPB_RETURN_STRONGEST);
+    spinner s = {UPB_SENSOR_HDL_64E_S3, TEN_HZ, 0, 0};
+    uint8_t packet[UPB_PACKET_BYTES];
+    upb_firing firings[UPB_PACKET_FIRINGS];
+    for (uint32_t n = 0; n < 100; n++)
+        next_packet(&encoder, &s, random, firings, packet);
+    CHECK_EQUAL(upb_packet_encoder_set_record(&encoder, &unit), UPB_PACKET_OK);
+    for (uint32_t n = 0; n < 16; n++) {
+        next_packet(&encoder, &s, random, firings, packet);
+        CHECK_EQUAL(packet[1204], "HMSDNYGTV1234567"[n]);
+        CHECK(n < 9 || n >= 14 || packet[1205] == (uint8_t)"UNIT#"[n - 9]);
+    }
+}
+
+/* An azimuth that stands still is no dual return. */
+static void test_stuck_is_not_dual(void) {
+    upb_packet_encoder encoder = encoder_of(UPB_SENSOR_HDL_64E_S3, UPB_RETURN_STRONGEST);
+    upb_packet_decoder decoder = decoder_of(UPB_SENSOR_AUTO, UPB_PICK_STRONGEST);
+    uint8_t packet[UPB_PACKET_BYTES];
+    upb_firing firing, got[UPB_PACKET_FIRINGS];
+    uint32_t ready = 0, count;
+    memset(&firing, 0, sizeof firing);
+    firing.beams = 64;
+    while (!ready)
+        CHECK_EQUAL(upb_packet_encode(&encoder, &firing, packet, &ready), UPB_PACKET_OK);
+    CHECK_EQUAL(upb_packet_decode(&decoder, packet, sizeof packet, got, &count, NULL), UPB_PACKET_OK);
+    CHECK(count == 6 && got[0].flags == UPB_FIRING_EMPTY && got[0].rate_mdeg_s == 0);
+}
+
 /* -------------------------------------------------------------------------------------------------------- encoder */
 
 static void test_encoder(random_source *random) {
@@ -595,6 +627,65 @@ static void test_troubles(void) {
     CHECK_EQUAL(upb_azimuth_tracker_init(&tracker, 0, 0), UPB_PACKET_E_ARGUMENT);
 }
 
+static upb_step track_at(upb_azimuth_tracker *tracker, uint64_t time_ns, uint32_t azimuth_mdeg, uint32_t rate_mdeg_s) {
+    upb_firing firing;
+    memset(&firing, 0, sizeof firing);
+    firing.time_ns = time_ns;
+    firing.azimuth_mdeg = azimuth_mdeg;
+    firing.rate_mdeg_s = rate_mdeg_s;
+    return upb_azimuth_track(tracker, &firing);
+}
+
+/* The clock is some firings wrong, either way, or goes on where the azimuth jumps: the azimuth counts. */
+static void test_azimuth_is_believed(void) {
+    static const int64_t wrong[] = {-11, -4, -1, 1, 5};
+    for (uint32_t k = 0; k < sizeof wrong / sizeof wrong[0]; k++) {
+        spinner s = {UPB_SENSOR_VLP_32C, TEN_HZ, 5 * UPB_HOUR_NS, 0};
+        upb_azimuth_tracker tracker = tracker_of(s.sensor, 0);
+        for (uint64_t n = 0; n < 100; n++)
+            track(&tracker, &s, n);
+        s.start_ns += (uint64_t)(wrong[k] * 55296);
+        const upb_step step = track(&tracker, &s, 100);
+        CHECK(step.flags == UPB_STEP_TIME_JUMP && step.firing == 100 && step.missing == 0);
+        CHECK(track(&tracker, &s, 102).missing == 1);
+    }
+    upb_azimuth_tracker tracker = tracker_of(UPB_SENSOR_HDL_32E, 0);
+    track_at(&tracker, UPB_HOUR_NS, 0, TEN_HZ);
+    track_at(&tracker, UPB_HOUR_NS + 46080, 170, TEN_HZ);
+    const upb_step step = track_at(&tracker, UPB_HOUR_NS + 2 * 46080, 60170, TEN_HZ);
+    CHECK(step.flags == UPB_STEP_TIME_JUMP && step.missing >= 355 && step.missing <= 365);
+}
+
+/* An azimuth that trembles at the cut begins one frame, not three. */
+static void test_trembling_cut(void) {
+    static const uint32_t azimuth[] = {89840, 89990, 90000, 89990, 90010, 90170};
+    upb_azimuth_tracker tracker = tracker_of(UPB_SENSOR_HDL_32E, 90000);
+    uint32_t frames = 0;
+    for (uint32_t k = 0; k < 6; k++) {
+        const upb_step step = track_at(&tracker, UPB_HOUR_NS + k * 46080, azimuth[k], TEN_HZ);
+        frames += (step.flags & UPB_STEP_FRAME) != 0;
+        CHECK_EQUAL(step.frame, k < 2 ? 0 : 1);
+        CHECK_EQUAL(step.firing, k);
+    }
+    CHECK_EQUAL(frames, 1);
+}
+
+/* The speed is followed within some 200 firings. */
+static void test_speed(void) {
+    upb_azimuth_tracker tracker = tracker_of(UPB_SENSOR_HDL_32E, 0);
+    double angle = 0.0;
+    for (uint64_t n = 0; n < 600; n++) {
+        const uint32_t rate = n < 300 ? TEN_HZ : TEN_HZ / 10 * 11;
+        const upb_step step = track_at(&tracker, UPB_HOUR_NS + n * 46080, (uint32_t)angle / 10 * 10, rate);
+        angle += rate * 46080e-9;
+        if (n == 299)
+            CHECK(step.rpm_milli > 599000 && step.rpm_milli < 601000);
+        if (n == 599)
+            CHECK(step.rpm_milli > 659000 && step.rpm_milli < 661000);
+    }
+    CHECK(upb_azimuth_turn_firings(&tracker) >= 1971 && upb_azimuth_turn_firings(&tracker) <= 1975);
+}
+
 /* Speed wanders by a tenth within a second: the clock counts on, the turns stay right, frames begin once each. */
 static void test_wander(random_source *random) {
     upb_azimuth_tracker tracker = tracker_of(UPB_SENSOR_HDL_32E, 90000);
@@ -638,6 +729,9 @@ static void test_points(void) {
     firing.rate_mdeg_s = TEN_HZ; /* 17.28 us after the begin: 62 mdeg on */
     CHECK_EQUAL(upb_firing_points(&c, &firing, points), 1);
     CHECK_EQUAL(points[0].azimuth_mdeg, 90062);
+    c.laser[8].azimuth_offset_mdeg = -1400;
+    CHECK_EQUAL(upb_firing_points(&c, &firing, points), 1);
+    CHECK_EQUAL(points[0].azimuth_mdeg, 88662);
     c.laser[8].distance_correction_um = -10000000; /* nothing is left of it */
     CHECK_EQUAL(upb_firing_points(&c, &firing, points), 0);
     c.laser[8].laser_id = 31;
@@ -669,11 +763,16 @@ int main(int argc, char **argv) {
     test_record(&random);
     test_record_stream(UPB_SENSOR_HDL_64E_S2, &random);
     test_record_stream(UPB_SENSOR_HDL_64E_S3, &random);
+    test_set_record(&random);
+    test_stuck_is_not_dual();
     test_encoder(&random);
     test_position();
     test_losses(&random);
     test_late();
     test_troubles();
+    test_azimuth_is_believed();
+    test_trembling_cut();
+    test_speed();
     test_wander(&random);
     test_points();
     return check_report("packets");
