@@ -104,6 +104,9 @@ bench: test-c $(VENV)/.bench
 soak: test-c $(VENV)/.dev
 	build/c/tests/runtime/c/test_model --count 1000000
 	build/c/tests/runtime/c/test_stream --count 20000
+	build/c/runtime/daemon/test_daemon --count 10000000
+	$(BIN)/python tests/runtime/daemon/soak_upbeamd.py --seconds 600
+	build/c/tests/runtime/packets/fuzz_packets --count 10000000
 	build/c/runtime/bus/tests/test_bus_fuzz --count 2000000
 	build/c/tests/runtime/packets/fuzz_packets --count 10000000
 	build/c/runtime/daemon/test_daemon --count 10000000

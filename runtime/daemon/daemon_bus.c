@@ -111,13 +111,15 @@ static upb_bus_snapshot snapshot_of(const upb_daemon *d) {
 
 _Static_assert(UPB_DROPS <= UPB_DROP_CAUSES_MAX, "every cause has its counter on the bus");
 
-/* Steps that a fault changed on its own account. */
-static void note_bus_faults(upb_daemon *d, uint64_t before) {
+/* Faults that the bus looks for itself: their events, and their sabotage. */
+void daemon_note_bus_faults(upb_daemon *d, uint64_t before) {
     static const upb_fault own[] = {UPB_FAULT_CAN_BUS_OFF, UPB_FAULT_CAN_COMMAND_REJECTED, UPB_FAULT_SERIAL_FRAMING,
                                     UPB_FAULT_POWER_RESET};
-    const uint64_t now = upb_faults_active(&d->bus.faults);
     for (size_t i = 0; i < sizeof own / sizeof own[0]; i++) {
         const uint64_t bit = UINT64_C(1) << (own[i] - 1);
+        if (!daemon_detects(d, own[i]))
+            upb_faults_clear(&d->bus.faults, (uint32_t)own[i]);
+        const uint64_t now = upb_faults_active(&d->bus.faults);
         if (!((before ^ now) & bit))
             continue;
         d->faults_ever |= now & bit;
@@ -130,7 +132,7 @@ static void step(upb_daemon *d, uint64_t now_ns) {
     const uint64_t before = upb_faults_active(&d->bus.faults);
     d->bus_step_ns = now_ns + BUS_STEP_NS;
     upb_bus_step(&d->bus, &snapshot, now_ns);
-    note_bus_faults(d, before);
+    daemon_note_bus_faults(d, before);
 }
 
 void daemon_bus_step(upb_daemon *d, uint64_t now_ns) {
@@ -143,7 +145,7 @@ void upb_daemon_can(upb_daemon *d, const upb_can_frame *frame, uint64_t received
     d->counters.can_received++;
     const uint64_t before = upb_faults_active(&d->bus.faults);
     upb_bus_can(&d->bus, frame, daemon_now(d));
-    note_bus_faults(d, before);
+    daemon_note_bus_faults(d, before);
     step(d, daemon_now(d)); /* answers do not wait */
 }
 
@@ -152,6 +154,6 @@ void upb_daemon_serial(upb_daemon *d, const uint8_t *data, size_t bytes, uint64_
     d->counters.serial_received += bytes;
     const uint64_t before = upb_faults_active(&d->bus.faults);
     upb_bus_serial(&d->bus, data, bytes, daemon_now(d));
-    note_bus_faults(d, before);
+    daemon_note_bus_faults(d, before);
     step(d, daemon_now(d));
 }

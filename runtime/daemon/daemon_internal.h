@@ -165,6 +165,7 @@ struct upb_daemon {
     uint64_t faults_ever;
     uint32_t ended;
     uint64_t heard_ns; /* when the last packet was taken, or waiting for one began */
+    uint64_t tick_ns;  /* of the last tick */
     uint32_t ticked;
     uint32_t sensor_silent; /* longer than config.timeout_ns */
 
@@ -286,5 +287,7 @@ uint32_t daemon_integrity_period(const upb_daemon *d);
 /* daemon_bus.c */
 upb_status daemon_bus_init(upb_daemon *d);
 void daemon_bus_step(upb_daemon *d, uint64_t now_ns);
+/* Events of the faults that the bus keeps itself; `before`: those active before it was called. */
+void daemon_note_bus_faults(upb_daemon *d, uint64_t before);
 
 #endif /* UPB_DAEMON_INTERNAL_H */

@@ -5,6 +5,7 @@
 #include "upb_internal.h"
 
 #define LOOK_NS (100 * NS_PER_MS)
+#define UNSEEN_NS (20 * NS_PER_MS) /* between two ticks: longer, and nobody was looking */
 
 /* ---------------------------------------------------------------------------------------------- names */
 
@@ -252,6 +253,7 @@ upb_status upb_daemon_init(void *memory, size_t memory_bytes, const upb_daemon_c
     daemon_ladder_init(d);
     daemon_integrity_init(d);
     d->heard_ns = d->health.looked_ns = daemon_now(d);
+    daemon_note_bus_faults(d, 0); /* POWER_RESET is known from the start */
     *daemon = d;
     return UPB_OK;
 }
@@ -308,7 +310,9 @@ void upb_daemon_tick(upb_daemon *d, uint64_t now_ns) {
         d->ticked = 1;
         if (!d->counters.packets_received)
             d->heard_ns = d->health.looked_ns = now_ns;
-    }
+    } else if (now_ns > d->tick_ns + UNSEEN_NS)
+        d->heard_ns += now_ns - d->tick_ns; /* the machine stood still: that says nothing of the sensor */
+    d->tick_ns = now_ns;
     watch_silence(d, now_ns);
     const uint64_t present = daemon_now(d);
     if (present - d->health.looked_ns >= LOOK_NS && !d->ended)

@@ -17,6 +17,18 @@ SENSORS = {"hdl-32e": HDL_32E, "vlp-32c": VLP_32C}
 MS = 1_000_000
 
 
+def sensor_settings() -> dict[str, object]:
+    """Of upbeamd, for a run that is to be judged as it would be on a vehicle."""
+    return {
+        "ladder_mean_ms": 5,
+        "ladder_repeat_ms": 10,
+        "ladder_pass_ms": 20,
+        "stale_ms": 40,
+        "timeout_ms": 50,
+        "rpm": 0,
+    }
+
+
 def model_file(sensor: str = "hdl-32e") -> bytes:
     return (MODELS / f"{sensor}.ubm").read_bytes()
 
