@@ -1,4 +1,4 @@
-"""The daemon on its buses: authenticated commands, faults of the buses, restarts. The bus itself has tests of its own."""
+"""The daemon on its buses: authenticated commands, bus faults, restarts. The bus itself has tests of its own."""
 
 from __future__ import annotations
 
