@@ -147,6 +147,7 @@ static void take_into_sequence(upb_daemon *d, const upb_packet_info *info, uint6
     s->taken_count = s->taken_count + 1 < 2 * TAKEN_KEPT ? s->taken_count + 1 : TAKEN_KEPT;
     watch_clocks(d, (int64_t)(received_ns - s->sensor_ns), received_ns);
     d->health.now.taken++;
+    d->heard_ns = daemon_now(d);
 }
 
 /* --------------------------------------------------------------------------------------------- refusing */
@@ -257,6 +258,7 @@ static void work(upb_daemon *d, const upb_firing *firings, uint32_t count, uint6
     if (daemon_is_virtual(d))
         daemon_time_at_least(d, begin_ns + service_ns);
     d->busy_until_ns = d->heard_ns = daemon_now(d);
+    daemon_ladder_worked(d, d->busy_until_ns - begin_ns);
     d->health.now.service_ns += d->busy_until_ns - begin_ns;
     d->health.now.service_packets++;
     if (mode != d->ladder.mode) { /* a mean over two modes says nothing */

@@ -133,6 +133,7 @@ typedef struct ladder {
     uint64_t calm_since_ns;          /* 0: not calm */
     uint64_t climbed_ns;
     uint64_t hold_ns;
+    uint64_t least_service_ns; /* of a packet since the mode changed */
 } ladder;
 
 typedef struct integrity {
@@ -253,6 +254,8 @@ void daemon_event(upb_daemon *d, upb_event_kind kind, uint32_t a, uint32_t b, ui
 void daemon_ladder_init(upb_daemon *d);
 void daemon_ladder_look(upb_daemon *d, uint64_t begin_ns);
 void daemon_ladder_apply(upb_daemon *d);
+/* A packet took so long. */
+void daemon_ladder_worked(upb_daemon *d, uint64_t service_ns);
 
 /* daemon_stream.c */
 void daemon_take_firing(upb_daemon *d, const upb_firing *firing, const upb_firing *second, uint64_t received_ns);

@@ -4,7 +4,8 @@
 enum { HOLD_DOUBLED_MAX = 16 };
 
 void daemon_ladder_init(upb_daemon *d) {
-    d->ladder = (ladder){.floor = d->config.mode_floor, .hold_ns = d->config.ladder_hold_ns};
+    d->ladder =
+        (ladder){.floor = d->config.mode_floor, .hold_ns = d->config.ladder_hold_ns, .least_service_ns = UINT64_MAX};
     d->ladder.mode = d->ladder.floor;
 }
 
@@ -19,6 +20,7 @@ void daemon_ladder_apply(upb_daemon *d) {
     if (mode != l->mode) {
         const uint32_t before = l->mode;
         l->mode = mode;
+        l->least_service_ns = UINT64_MAX;
         d->counters.mode_changes++;
         daemon_event(d, UPB_EVENT_MODE, before, mode, d->lag_ns);
     }
@@ -33,10 +35,22 @@ static uint32_t mode_of_lag(const upb_daemon_config *config, uint64_t lag_ns) {
     return mode;
 }
 
+/* Did every packet since the climb take more than half of the time there is? Else the machine stood still, and no mode
+ * helps with that. */
+static int work_is_heavy(const upb_daemon *d) {
+    const uint64_t least = d->ladder.least_service_ns;
+    return least != UINT64_MAX && 2 * least > (uint64_t)d->cycle_ns * d->packet_firings;
+}
+
+void daemon_ladder_worked(upb_daemon *d, uint64_t service_ns) {
+    if (service_ns < d->ladder.least_service_ns)
+        d->ladder.least_service_ns = service_ns;
+}
+
 static void fall(upb_daemon *d, uint32_t mode, uint64_t now_ns) {
     ladder *l = &d->ladder;
     /* Whoever climbs and falls at once has climbed too early: wait longer next time. */
-    if (l->climbed_ns && now_ns - l->climbed_ns < 2 * l->hold_ns &&
+    if (l->climbed_ns && now_ns - l->climbed_ns < 2 * l->hold_ns && work_is_heavy(d) &&
         l->hold_ns < HOLD_DOUBLED_MAX * d->config.ladder_hold_ns)
         l->hold_ns *= 2;
     l->climbed_ns = 0;
