@@ -7,7 +7,6 @@
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
-#include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <poll.h>
@@ -23,54 +22,13 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "file_writer.h"
 #include "network.h"
-#include "packet_ring.h"
-#include "report.h"
-#include "settings.h"
-#ifdef UPBEAMD_SOCKETCAN
-#include "upb_socketcan.h"
-#endif
+#include "process.h"
 
 enum {
-    MODELS_MAX = 64,
-    BATCH = 32, /* datagrams a call receives */
     TICK_NS = 5000000,
-    WAIT_MS = 5, /* of the working thread, when nothing comes */
-    RECEIVE_WAIT_MS = 100,
-    MODELS_BYTES_MAX = 1 << 20
+    WAIT_MS = 5 /* of the working thread, when nothing comes */
 };
-
-typedef struct model_file {
-    uint8_t *content;
-    size_t bytes;
-} model_file;
-
-typedef struct process {
-    settings settings;
-    upb_daemon *daemon;
-    process_counts counts;
-    packet_ring ring;
-    file_writer writer;
-    int data_fd, position_fd, columns_fd, hdl64_fd, can_fd, serial_fd;
-    int wake[2]; /* the receiving thread writes a byte when the other one sleeps */
-    _Atomic uint32_t sleeping;
-    _Atomic uint32_t stop;
-    _Atomic uint64_t receive_failed, positions_full;
-    struct sockaddr_in can_to;
-    FILE *ledger;
-    uint64_t ticked_ns, reported_ns, watchdog_ns;
-    uint64_t watchdog_period_ns;  /* of systemd; 0: none */
-    int at_end;                   /* the status file gets the ledger as well */
-    uint32_t reload_wanted;       /* the kept model was found damaged */
-    uint32_t calibration_columns; /* per turn, that the file was written for */
-    model_file models[MODELS_MAX];
-    size_t model_count;
-#ifdef UPBEAMD_SOCKETCAN
-    upb_socketcan socketcan;
-    int has_socketcan;
-#endif
-} process;
 
 /* The only thing that a signal handler may reach. */
 static int signal_pipe[2] = {-1, -1};
@@ -83,286 +41,11 @@ static void on_signal(int number) {
     errno = error;
 }
 
-static uint64_t monotonic_ns(void *user) {
+uint64_t process_now(void *user) {
     struct timespec t;
     (void)user;
     clock_gettime(CLOCK_MONOTONIC, &t);
     return (uint64_t)t.tv_sec * UINT64_C(1000000000) + (uint64_t)t.tv_nsec;
-}
-
-/* -------------------------------------------------------------------------------------------- receiving */
-
-static void take_batch(process *p, int fd, ring_kind kind) {
-    uint8_t data[BATCH][RING_DATAGRAM_MAX + 1];
-    struct sockaddr_in from[BATCH];
-    struct iovec parts[BATCH];
-    struct mmsghdr messages[BATCH];
-    for (;;) {
-        memset(messages, 0, sizeof messages);
-        for (unsigned i = 0; i < BATCH; i++) {
-            parts[i] = (struct iovec){data[i], sizeof data[i]};
-            messages[i].msg_hdr.msg_iov = &parts[i];
-            messages[i].msg_hdr.msg_iovlen = 1;
-            messages[i].msg_hdr.msg_name = &from[i];
-            messages[i].msg_hdr.msg_namelen = sizeof from[i];
-        }
-        const int count = recvmmsg(fd, messages, BATCH, MSG_DONTWAIT, NULL);
-        if (count < 0 && errno != EAGAIN && errno != EINTR)
-            atomic_fetch_add(&p->receive_failed, 1);
-        if (count <= 0)
-            return;
-        const uint64_t now = monotonic_ns(NULL);
-        for (int i = 0; i < count; i++) {
-            ring_datagram *slot = packet_ring_claim(&p->ring);
-            if (!slot && kind == RING_DATA)
-                packet_ring_count_full(&p->ring);
-            else if (!slot)
-                atomic_fetch_add(&p->positions_full, 1);
-            if (!slot)
-                continue;
-            slot->received_ns = now;
-            slot->source_ipv4 = ntohl(from[i].sin_addr.s_addr);
-            slot->bytes = (uint16_t)messages[i].msg_len;
-            slot->kind = (uint16_t)kind;
-            memcpy(slot->data, data[i], messages[i].msg_len);
-            packet_ring_publish(&p->ring);
-        }
-        if (count < BATCH)
-            return;
-    }
-}
-
-static void wake_worker(process *p) {
-    const char byte = 0;
-    if (atomic_exchange(&p->sleeping, 0) && write(p->wake[1], &byte, 1) < 0)
-        return; /* full: it is awake */
-}
-
-static void *receive(void *user) {
-    process *p = user;
-    struct pollfd fds[2] = {{.fd = p->data_fd, .events = POLLIN}, {.fd = p->position_fd, .events = POLLIN}};
-    while (!atomic_load(&p->stop)) {
-        const int ready = poll(fds, 2, RECEIVE_WAIT_MS);
-        if (ready <= 0)
-            continue;
-        if (fds[0].revents)
-            take_batch(p, p->data_fd, RING_DATA);
-        if (fds[1].revents)
-            take_batch(p, p->position_fd, RING_POSITION);
-        wake_worker(p);
-    }
-    return NULL;
-}
-
-/* ---------------------------------------------------------------------------------------------- sending */
-
-static void send_datagram(process *p, int fd, const void *data, size_t bytes) {
-    if (send(fd, data, bytes, MSG_DONTWAIT | MSG_NOSIGNAL) != (ssize_t)bytes)
-        p->counts.send_failed++;
-}
-
-static void send_columns(void *user, uint64_t time_ns, const uint8_t *data, size_t bytes) {
-    process *p = user;
-    (void)time_ns;
-    send_datagram(p, p->columns_fd, data, bytes);
-}
-
-static void send_hdl64(void *user, uint64_t time_ns, const uint8_t *data, size_t bytes) {
-    process *p = user;
-    (void)time_ns;
-    send_datagram(p, p->hdl64_fd, data, bytes);
-}
-
-static upb_send send_can(void *user, uint64_t time_ns, const upb_can_frame *frame) {
-    process *p = user;
-    uint8_t bytes[UPB_CAN_WIRE_MAX];
-    (void)time_ns;
-#ifdef UPBEAMD_SOCKETCAN
-    if (p->has_socketcan) {
-        const upb_can_transport transport = upb_socketcan_transport(&p->socketcan);
-        return transport.send(transport.user, frame);
-    }
-#endif
-    const size_t count = upb_can_frame_encode(frame, bytes);
-    const ssize_t sent = sendto(p->can_fd, bytes, count, MSG_DONTWAIT | MSG_NOSIGNAL,
-                                (const struct sockaddr *)&p->can_to, sizeof p->can_to);
-    if (sent == (ssize_t)count)
-        return UPB_SEND_DONE;
-    return errno == EAGAIN || errno == ENOBUFS ? UPB_SEND_BUSY : UPB_SEND_FAILED;
-}
-
-/* All or nothing: a record that fits the line's buffer in part would be two broken ones. */
-static upb_send send_serial(void *user, uint64_t time_ns, const uint8_t *data, size_t bytes) {
-    process *p = user;
-    (void)time_ns;
-    const ssize_t sent = write(p->serial_fd, data, bytes);
-    if (sent == (ssize_t)bytes)
-        return UPB_SEND_DONE;
-    return sent < 0 && errno == EAGAIN ? UPB_SEND_BUSY : UPB_SEND_FAILED;
-}
-
-static void write_record(void *user, const upb_ledger_record *record) {
-    process *p = user;
-    if (!p->ledger)
-        return;
-    report_record(p->ledger, record);
-    fputc('\n', p->ledger);
-}
-
-static void write_event(void *user, const upb_event *event) {
-    process *p = user;
-    if (event->kind == UPB_EVENT_INTEGRITY && event->a == UPB_REGION_KEPT)
-        p->reload_wanted = 1;
-    if (!p->ledger)
-        return;
-    report_event(p->ledger, event);
-    fputc('\n', p->ledger);
-}
-
-/* ----------------------------------------------------------------------------------------- kept on disk */
-
-static int store_path(const process *p, upb_store what, char *path, size_t bytes) {
-    const char *name = what == UPB_STORE_FRESHNESS ? "freshness" : "faults";
-    return snprintf(path, bytes, "%s/%s", p->settings.state, name) < (int)bytes;
-}
-
-static upb_stored read_store(void *user, upb_store what, uint8_t *bytes, size_t count) {
-    char path[4096];
-    if (!store_path(user, what, path, sizeof path))
-        return UPB_STORED_FAILED;
-    FILE *file = fopen(path, "rb");
-    if (!file)
-        return errno == ENOENT ? UPB_STORED_NOTHING : UPB_STORED_FAILED;
-    const int whole = fread(bytes, 1, count, file) == count && fgetc(file) == EOF;
-    fclose(file);
-    return whole ? UPB_STORED_DONE : UPB_STORED_FAILED;
-}
-
-/* The freshness counter must be on disk before the command it came with is carried out; the fault memory can follow. */
-static upb_stored write_store(void *user, upb_store what, const uint8_t *bytes, size_t count) {
-    process *p = user;
-    char path[4096];
-    if (!store_path(user, what, path, sizeof path))
-        return UPB_STORED_FAILED;
-    void *const copy = what == UPB_STORE_FAULTS && p->writer.started ? malloc(count) : NULL;
-    if (!copy)
-        return file_replace(path, bytes, count) ? UPB_STORED_DONE : UPB_STORED_FAILED;
-    memcpy(copy, bytes, count);
-    file_writer_put(&p->writer, WRITE_FAULTS, path, copy, count);
-    return UPB_STORED_DONE;
-}
-
-/* -------------------------------------------------------------------------------------------- the models */
-
-static int find_model(void *user, uint32_t crc32, const void **ubm, size_t *bytes) {
-    process *p = user;
-    for (size_t i = 0; i < p->model_count; i++) {
-        const model_file *model = &p->models[i];
-        uint32_t crc = 0;
-        for (unsigned b = 0; model->bytes >= 4 && b < 4; b++) /* a model file ends with its checksum */
-            crc |= (uint32_t)model->content[model->bytes - 4 + b] << 8 * b;
-        if (model->bytes < 4 || crc != crc32)
-            continue;
-        *ubm = model->content;
-        *bytes = model->bytes;
-        return 1;
-    }
-    return 0;
-}
-
-static void forget_models(process *p) {
-    while (p->model_count)
-        free(p->models[--p->model_count].content);
-}
-
-/* Read when the process begins and on SIGHUP: a command must not wait for a disk. */
-static void read_models(process *p) {
-    char path[4096];
-    forget_models(p);
-    DIR *folder = p->settings.models[0] ? opendir(p->settings.models) : NULL;
-    if (p->settings.models[0] && !folder)
-        fprintf(stderr, "upbeamd: %s: %s\n", p->settings.models, strerror(errno));
-    for (struct dirent *entry; folder && p->model_count < MODELS_MAX && (entry = readdir(folder));) {
-        const char *end = strrchr(entry->d_name, '.');
-        if (!end || strcmp(end, ".ubm") != 0 ||
-            snprintf(path, sizeof path, "%s/%s", p->settings.models, entry->d_name) >= (int)sizeof path)
-            continue;
-        model_file *model = &p->models[p->model_count];
-        model->content = file_read(path, MODELS_BYTES_MAX, &model->bytes);
-        p->model_count += model->content != NULL;
-    }
-    if (folder)
-        closedir(folder);
-}
-
-static void print_error(const char *what, upb_status status, const upb_error *error) {
-    fprintf(stderr, "upbeamd: %s: %s%s%s", what, error->what, error->what[0] ? ": " : "", upb_status_text(status));
-    if (error->got || error->expected)
-        fprintf(stderr, " (got %llu, expected %llu)", (unsigned long long)error->got,
-                (unsigned long long)error->expected);
-    fputc('\n', stderr);
-}
-
-static void reload(process *p) {
-    upb_error error;
-    size_t bytes = 0;
-    memset(&error, 0, sizeof error);
-    read_models(p);
-    uint8_t *ubm = file_read(p->settings.model, MODELS_BYTES_MAX, &bytes);
-    static const uint8_t nothing[1];
-    const upb_status status =
-        upb_daemon_swap_model(p->daemon, ubm ? ubm : nothing, ubm ? bytes : 0, monotonic_ns(NULL), &error);
-    if (status == UPB_OK)
-        fprintf(stderr, "upbeamd: %s: in use from the next frame on\n", p->settings.model);
-    else
-        print_error(p->settings.model, status, &error);
-    free(ubm);
-}
-
-/* --------------------------------------------------------------------------------------------- reporting */
-
-/* Text of malloc() that `write_to` prints; null without memory. */
-static char *printed(void (*write_to)(FILE *to, void *user), void *user, size_t *bytes) {
-    char *text = NULL;
-    FILE *memory = open_memstream(&text, bytes);
-    if (!memory)
-        return NULL;
-    write_to(memory, user);
-    if (fclose(memory) == 0)
-        return text;
-    free(text);
-    return NULL;
-}
-
-static void print_status(FILE *to, void *user) {
-    process *p = user;
-    report_status(to, p->daemon, &p->counts, p->at_end);
-}
-
-static void print_calibration(FILE *to, void *user) {
-    report_calibration(to, upb_daemon_get_calibration(((process *)user)->daemon));
-}
-
-static void write_status(process *p) {
-    size_t bytes = 0;
-    if (!p->settings.json[0])
-        return;
-    p->counts.receive_failed = atomic_load(&p->receive_failed);
-    p->counts.positions_full = atomic_load(&p->positions_full);
-    char *const text = printed(print_status, p, &bytes);
-    if (text)
-        file_writer_put(&p->writer, WRITE_STATUS, p->settings.json, text, bytes);
-}
-
-static void write_calibration(process *p) {
-    const uint32_t columns = upb_daemon_get_status(p->daemon).columns;
-    size_t bytes = 0;
-    if (!p->settings.calibration[0] || !upb_daemon_get_calibration(p->daemon) || columns == p->calibration_columns)
-        return;
-    p->calibration_columns = columns;
-    char *const text = printed(print_calibration, p, &bytes);
-    if (text)
-        file_writer_put(&p->writer, WRITE_CALIBRATION, p->settings.calibration, text, bytes);
 }
 
 /* To systemd, where it listens. */
@@ -382,40 +65,6 @@ static void notify(const char *text) {
         close(fd);
 }
 
-/* --------------------------------------------------------------------------------------------- the buses */
-
-static void take_can(process *p) {
-    uint8_t bytes[UPB_CAN_WIRE_MAX + 1];
-    upb_can_frame frame;
-#ifdef UPBEAMD_SOCKETCAN
-    if (p->has_socketcan) {
-        while (upb_socketcan_receive(&p->socketcan, &frame) == 1)
-            upb_daemon_can(p->daemon, &frame, monotonic_ns(NULL));
-        return;
-    }
-#endif
-    for (unsigned i = 0; i < BATCH; i++) {
-        const ssize_t count = recv(p->can_fd, bytes, sizeof bytes, MSG_DONTWAIT);
-        if (count < 0)
-            return;
-        if (upb_can_frame_decode(bytes, (size_t)count, &frame) == UPB_OK)
-            upb_daemon_can(p->daemon, &frame, monotonic_ns(NULL));
-        else
-            p->counts.can_failed++;
-    }
-}
-
-static void take_serial(process *p) {
-    uint8_t bytes[512];
-    const ssize_t count = read(p->serial_fd, bytes, sizeof bytes);
-    if (count > 0)
-        upb_daemon_serial(p->daemon, bytes, (size_t)count, monotonic_ns(NULL));
-    else if (count == 0 || errno != EAGAIN) { /* the line is gone */
-        close(p->serial_fd);
-        p->serial_fd = -1;
-    }
-}
-
 /* ------------------------------------------------------------------------------------------------- work */
 
 static void tick(process *p, uint64_t now) {
@@ -423,12 +72,12 @@ static void tick(process *p, uint64_t now) {
     p->ticked_ns = now;
     if (p->reload_wanted) {
         p->reload_wanted = 0;
-        reload(p);
+        files_reload(p);
     }
     if (now - p->reported_ns >= (uint64_t)p->settings.json_ms * 1000000) {
         p->reported_ns = now;
-        write_status(p);
-        write_calibration(p);
+        files_write_status(p);
+        files_write_calibration(p);
         if (p->ledger)
             fflush(p->ledger);
     }
@@ -448,7 +97,7 @@ static void drain(process *p) {
         else
             upb_daemon_position(p->daemon, d->data, d->bytes, d->source_ipv4, d->received_ns);
         packet_ring_release(&p->ring);
-        const uint64_t now = monotonic_ns(NULL);
+        const uint64_t now = process_now(NULL);
         if (now - p->ticked_ns >= TICK_NS)
             tick(p, now);
     }
@@ -461,7 +110,7 @@ static int take_signals(process *p) {
         if (byte != SIGHUP)
             return 0;
         p->counts.reloads++;
-        reload(p);
+        files_reload(p);
     }
     return 1;
 }
@@ -487,12 +136,12 @@ static void work(process *p) {
             empty_pipe(p->wake[0]);
         drain(p);
         if (ready > 0 && fds[2].revents)
-            take_can(p);
+            links_take_can(p);
         if (ready > 0 && fds[3].revents)
-            take_serial(p);
+            links_take_serial(p);
         if (ready > 0 && fds[1].revents && !take_signals(p))
             return;
-        const uint64_t now = monotonic_ns(NULL);
+        const uint64_t now = process_now(NULL);
         if (now - p->ticked_ns >= TICK_NS)
             tick(p, now);
     }
@@ -611,17 +260,17 @@ static int make_daemon(process *p) {
         return 0;
     c->key = p->settings.key[0] ? key : NULL;
     if (p->settings.state[0])
-        c->storage = (upb_storage){read_store, write_store, p};
-    c->find_model = find_model;
+        c->storage = (upb_storage){files_read_store, files_write_store, p};
+    c->find_model = files_find_model;
     c->user = p;
-    c->clock = (upb_clock){monotonic_ns, NULL};
+    c->clock = (upb_clock){process_now, NULL};
     c->sinks = (upb_daemon_sinks){.user = p,
-                                  .column_stream = p->columns_fd >= 0 ? send_columns : NULL,
-                                  .hdl64 = p->hdl64_fd >= 0 ? send_hdl64 : NULL,
-                                  .can = p->can_fd >= 0 ? send_can : NULL,
-                                  .serial = p->serial_fd >= 0 ? send_serial : NULL,
-                                  .ledger = write_record,
-                                  .event = write_event};
+                                  .column_stream = p->columns_fd >= 0 ? links_send_columns : NULL,
+                                  .hdl64 = p->hdl64_fd >= 0 ? links_send_hdl64 : NULL,
+                                  .can = p->can_fd >= 0 ? links_send_can : NULL,
+                                  .serial = p->serial_fd >= 0 ? links_send_serial : NULL,
+                                  .ledger = files_write_record,
+                                  .event = files_write_event};
     uint8_t *ubm = file_read(p->settings.model, MODELS_BYTES_MAX, &bytes);
     if (!ubm)
         return 0;
@@ -633,7 +282,7 @@ static int make_daemon(process *p) {
     memset(key, 0, sizeof key);
     if (status == UPB_OK)
         return 1;
-    print_error(error.what[0] && status == UPB_E_ARGUMENT ? "setting" : p->settings.model, status, &error);
+    files_print_error(error.what[0] && status == UPB_E_ARGUMENT ? "setting" : p->settings.model, status, &error);
     free(memory);
     return 0;
 }
@@ -739,10 +388,10 @@ static int run(process *p) {
     ring_datagram *slots = calloc(p->settings.ring_packets, sizeof *slots);
     if (!slots || !open_all(p) || !make_daemon(p))
         return 1;
-    read_models(p);
+    files_read_models(p);
     packet_ring_init(&p->ring, slots, p->settings.ring_packets);
     catch_signals();
-    if (!file_writer_start(&p->writer) || pthread_create(&receiver, NULL, receive, p) != 0) {
+    if (!file_writer_start(&p->writer) || pthread_create(&receiver, NULL, process_receive, p) != 0) {
         fputs("upbeamd: no thread\n", stderr);
         return 1;
     }
@@ -758,17 +407,17 @@ static int run(process *p) {
     atomic_store(&p->stop, 1);
     pthread_join(receiver, NULL);
     drain(p);
-    const uint64_t full = packet_ring_take_full(&p->ring), now = monotonic_ns(NULL);
+    const uint64_t full = packet_ring_take_full(&p->ring), now = process_now(NULL);
     if (full)
         upb_daemon_queue_full(p->daemon, full, now);
     upb_daemon_end(p->daemon, now);
-    write_calibration(p);
+    files_write_calibration(p);
     p->at_end = 1;
-    write_status(p);
+    files_write_status(p);
     file_writer_end(&p->writer);
     if (p->ledger)
         fclose(p->ledger);
-    forget_models(p);
+    files_forget_models(p);
     free(p->daemon);
     free(slots);
     return 0;
