@@ -173,3 +173,16 @@ def test_reader_refuses_what_is_no_datagram() -> None:
     for bad in (good[:-1], good + b"\0", b"UPCX" + good[4:], good[:4] + b"\2" + good[5:], good[:20], b""):
         with pytest.raises(ColumnStreamError):
             read_columns(bad)
+
+
+def test_the_hour_passes_unnoticed() -> None:
+    """The sensor's clock begins anew every hour; times on the wire go on."""
+    feed = Feed(start_ns=3_599_900_000_000)
+    daemon, out = played(feed, feed.make(3))
+    columns = columns_of(out)
+    assert len(columns) == daemon.counters["firings_processed"]
+    assert daemon.counters["resyncs"] == 0
+    assert daemon.status["faults_ever"] == []
+    steps = np.diff([c.time_ns for c in columns])
+    assert abs(steps - feed.cycle_ns).max() <= 1000, "packets carry whole microseconds"
+    assert [r["verdict"] for r in out.ledger] == ["partial", "met", "partial"]
