@@ -1,4 +1,5 @@
-"""Prints the tables of the degradation ladder in docs/upbeamd.md: what a rung costs to compute and in accuracy.
+"""Prints figures of docs/upbeamd.md: what a rung of the degradation ladder costs to compute and in accuracy, and what a
+packet costs the daemon's core.
 
     .venv/bin/python docs/make_ladder.py [FOLDER OF KITTI FRAMES]
 
@@ -25,7 +26,9 @@ from upbeam.model.beams import beam_table
 from upbeam.model.evaluate import evaluate
 from upbeam.model.frames import Frame, kitti_frames
 from upbeam.runtime import _native
+from upbeam.runtime.daemon import Daemon
 from upbeam.runtime.ladder import LADDER, ladder_rows
+from upbeam.runtime.packets import Encoder, Firings, sensor_info
 
 COLUMNS, REPEATS = 2048, 60
 PRECISIONS = ("fp32", "int16", "int8")
@@ -60,6 +63,33 @@ def costs() -> None:
             print(f"  {mode:13}", *(f"{least[cpu, mode, p]:7.1f}" for p in PRECISIONS))
 
 
+def work() -> None:
+    """Microseconds of the core on a packet of 12 firings, the call from Python included: least of all repetitions."""
+    rng = np.random.default_rng(1)
+    count = 1808 * 12
+    info = sensor_info("hdl-32e")
+    turn = np.arange(count) * info.firing_cycle_ns
+    firings = Firings.of(
+        rng.integers(1500, 20000, (count, 32)).astype(np.uint16),
+        rng.integers(0, 256, (count, 32)).astype(np.uint8),
+        azimuth_mdeg=turn * 36 // 10_000 // 10 * 10 % 360_000,
+        time_ns=turn,
+    )
+    packets = Encoder("hdl-32e").encode(firings)
+    sent = turn[11::12] + info.firing_cycle_ns
+    model = resources.files("upbeam.quant").joinpath("models").joinpath("hdl-32e.ubm").read_bytes()
+    print(f"\nint16, HDL-32E, microseconds of {12 * info.firing_cycle_ns / 1e3:.0f} on a packet")
+    for outputs in ((), ("columns",), ("columns", "hdl64"), ("columns", "hdl64", "can", "serial")):
+        least = float("inf")
+        for _ in range(8):
+            daemon = Daemon(model, {"ledger_capacity": 64}, outputs=outputs)
+            begin = time.perf_counter_ns()
+            for data, now in zip(packets, sent.tolist(), strict=True):
+                daemon.packet(data, now)
+            least = min(least, (time.perf_counter_ns() - begin) / len(packets))
+        print(f"  {', '.join(outputs) or 'no output':28} {least / 1e3:6.2f}")
+
+
 def frames(folder: str | None, model: Any) -> Iterator[Frame]:
     if folder:
         files = kitti_files_of_drives(Path(folder), ["drive-a"])
@@ -81,4 +111,5 @@ def accuracy(folder: str | None) -> None:
 
 if __name__ == "__main__":
     costs()
+    work()
     accuracy(sys.argv[1] if len(sys.argv) > 1 else None)
