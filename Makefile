@@ -67,7 +67,7 @@ test-c: $(VENV)/.tools
 
 test-c-all: $(VENV)/.tools
 	$(call c_tests,c-sanitize,-DCMAKE_BUILD_TYPE=RelWithDebInfo -DUPBEAM_SANITIZE=ON)
-	$(call c_tests,c-thread,-DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_C_FLAGS=-fsanitize=thread,-R "live|stream")
+	$(call c_tests,c-thread,-DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_C_FLAGS=-fsanitize=thread,-R "live|stream|upbeamd")
 	$(call c_tests,c-clang,-DCMAKE_BUILD_TYPE=Release -DCMAKE_C_COMPILER=clang)
 	$(call c_tests,c-aarch64,-DCMAKE_BUILD_TYPE=Release -DCMAKE_TOOLCHAIN_FILE=runtime/cmake/aarch64.cmake)
 
