@@ -50,7 +50,7 @@ demo: $(VENV)/.installed
 	@$(BIN)/upbeam stream --source sim --frames 200 --report build/demo
 
 test: $(VENV)/.dev test-c
-	$(BIN)/python -m pytest -m "not train"
+	$(BIN)/python -m pytest -m "not train" --numprocesses auto --dist loadfile
 
 # $(call c_tests,FOLDER,CMAKE OPTIONS,CTEST OPTIONS): configure, build, run one variant of the C tests.
 CMAKE := $(abspath $(BIN))/cmake

@@ -43,6 +43,17 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
     return [seed, f"real data: {data if data.is_dir() else f'none ({data} is not a folder; UPBEAM_DATA)'}"]
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """What passed tests printed: measured figures, seeds, counts. (Failed ones show theirs anyway.)"""
+    printed = [r for r in terminalreporter.getreports("passed") if r.when == "call" and r.capstdout.strip()]
+    if printed:
+        terminalreporter.section("printed by the tests")
+    for report in printed:
+        test = report.nodeid.split("::", 1)[1]
+        for line in report.capstdout.strip().splitlines():
+            terminalreporter.write_line(f"{test}: {line}")
+
+
 @pytest.fixture
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     """Random numbers of this test's own, from the session's seed: the same alone and in any order."""

@@ -151,7 +151,7 @@ def test_integer_kernels_are_the_contract(device, rng, precision, rules, variant
         assert differing(on_device(*image), upsample_integer(*image, file.integer(precision), file.rules)) == 0
 
 
-def test_kitti(device, rng, data_dir, capsys):
+def test_kitti(device, rng, data_dir):
     """The shipped model on recorded frames: float on all, integers on a few (their reference is NumPy)."""
     model = upbeam.load_model()
     cpu = upbeam.Upsampler(model)
@@ -169,8 +169,7 @@ def test_kitti(device, rng, data_dir, capsys):
         for name, reference in expected.items():
             differ[name] += differing(on_device[name](*image), reference)
             seen[name] += 31 * model.columns
-    with capsys.disabled():
-        print(f"\nOpenCL, windows of KITTI that differ: {', '.join(f'{n} {differ[n]} of {seen[n]}' for n in seen)}")
+    print(f"OpenCL, windows of KITTI that differ: {', '.join(f'{n} {differ[n]} of {seen[n]}' for n in seen)}")
     assert min(seen.values()) > 0
     assert differ["int16"] == differ["int8"] == 0
     assert differ["fp32"] <= seen["fp32"] * 1e-4

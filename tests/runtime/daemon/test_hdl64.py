@@ -48,9 +48,7 @@ def played(feed: Feed, turns: float, **settings: Any) -> tuple[Daemon, Outputs, 
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_the_oracle_reads_points_of_the_column_stream(
-    sensor: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_oracle_reads_points_of_the_column_stream(sensor: str, tmp_path: Path) -> None:
     """Range within half a count; azimuth and elevation within 0.01 degrees (rounded on the wire); the same ring."""
     feed = Feed(sensor)
     daemon, out, columns = played(feed, 14, rpm=600)  # 4160 packets tell the whole record
@@ -71,12 +69,10 @@ def test_the_oracle_reads_points_of_the_column_stream(
     seen = np.degrees(-np.arctan2(points[:, 1], points[:, 0]))
     apart = (seen - azimuth / 1e3 + 180.0) % 360.0 - 180.0
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))) - table[row, 0] / 1e3
-    with capsys.disabled():
-        print(
-            f"\n{sensor} as HDL-64E: {len(points)} points, range {np.abs(ranges).max() * 1e3:.3f} mm, "
-            f"azimuth {np.abs(apart).max():.4f} deg, elevation {np.abs(elevation).max():.4f} deg",
-            end="",
-        )
+    print(
+        f"{sensor} as HDL-64E: {len(points)} points, range {np.abs(ranges).max() * 1e3:.3f} mm, "
+        f"azimuth {np.abs(apart).max():.4f} deg, elevation {np.abs(elevation).max():.4f} deg",
+    )
     assert np.abs(ranges).max() <= 0.5 * UNIT_M[sensor]
     assert np.abs(apart).max() <= 0.0101  # rounded twice to 0.01 degrees, then to float32
     assert np.abs(elevation).max() <= 0.01
@@ -84,9 +80,7 @@ def test_the_oracle_reads_points_of_the_column_stream(
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_measured_points_stay_where_the_sensor_saw_them(
-    sensor: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_measured_points_stay_where_the_sensor_saw_them(sensor: str, tmp_path: Path) -> None:
     """The oracle on the sensor's own packets and on ours: each measured beam at its own azimuth, firing times too."""
     feed = Feed(sensor)
     daemon, out, _ = played(feed, 2.2, rpm=600)
@@ -111,12 +105,10 @@ def test_measured_points_stay_where_the_sensor_saw_them(
         if i is not None:
             before, after = (np.degrees(np.arctan2(p[1], p[0])) for p in (original[i], point))
             apart.append((after - before + 180.0) % 360.0 - 180.0)
-    with capsys.disabled():
-        print(
-            f"\n{sensor}: {len(apart)} measured points, azimuth beside the sensor's own packets: "
-            f"p99 {np.percentile(np.abs(apart), 99):.4f}, max {np.abs(apart).max():.4f} deg",
-            end="",
-        )
+    print(
+        f"{sensor}: {len(apart)} measured points, azimuth beside the sensor's own packets: "
+        f"p99 {np.percentile(np.abs(apart), 99):.4f}, max {np.abs(apart).max():.4f} deg",
+    )
     assert len(apart) > 10_000
     assert np.abs(apart).max() <= 0.03  # two roundings on the wire, and the oracle's last firing of a packet
 

@@ -272,7 +272,7 @@ CAPTURES = {
 
 
 @pytest.mark.parametrize("name", list(CAPTURES))
-def test_real_turns(name: str, data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_real_turns(name: str, data_dir: Path) -> None:
     """Nothing is missing in whole captures but what the sensor left out of the turn; frames begin once a turn."""
     sensor, jumps = CAPTURES[name]
     decoder = Decoder()
@@ -289,8 +289,7 @@ def test_real_turns(name: str, data_dir: Path, capsys: pytest.CaptureFixture[str
     turns = (int(steps.angle_mdeg[-1]) - int(steps.angle_mdeg[0])) / 360e3
     assert np.count_nonzero(steps.flags & Steps.FRAME) in {int(turns), int(turns) + 1}
     low, high = steps.rpm_milli[100:].min() / 1e3, steps.rpm_milli[100:].max() / 1e3
-    with capsys.disabled():
-        print(f"\n{name}: {turns:.2f} turns, {low:.1f} to {high:.1f} rpm, {tracker.turn_firings} firings", end="")
+    print(f"{name}: {turns:.2f} turns, {low:.1f} to {high:.1f} rpm, {tracker.turn_firings} firings")
     if jumps:  # the part left out, as a share of the turn
         assert 0.4 < steps.missing[jumped][1:].mean() / tracker.turn_firings < 0.6
 

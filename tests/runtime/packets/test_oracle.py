@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -137,13 +136,12 @@ def _key(packet: Any, column: Any, ring: Any, kind: Any) -> NDArray[np.int64]:
     return np.asarray(((parts[0] * 64 + parts[1]) * 64 + parts[2]) * 4 + parts[3])
 
 
-def check(matched: Matched, unit_um: int, capsys: pytest.CaptureFixture[str], name: str) -> None:
+def check(matched: Matched, unit_um: int, name: str) -> None:
     ranges, azimuth, elevation = matched.range_error(), matched.azimuth_error_deg(), matched.elevation_error_deg()
-    with capsys.disabled() if name else contextlib.nullcontext():
+    if name:
         print(
-            f"\n{name}: {len(matched.xyz)} points, largest difference {ranges * 1e3:.3f} mm, "
+            f"{name}: {len(matched.xyz)} points, largest difference {ranges * 1e3:.3f} mm, "
             f"azimuth {azimuth:.4f} deg, elevation {elevation:.5f} deg",
-            end="",
         )
     assert len(matched.xyz) > 1000
     assert ranges <= COUNT * unit_um * 1e-6
@@ -175,20 +173,18 @@ def spin(
 
 @pytest.mark.parametrize("sensor", ["hdl-32e", "vlp-32c", "vlp-16"])
 @pytest.mark.parametrize("mode", ["strongest", "dual"])
-def test_the_oracle_reads_our_packets(
-    sensor: str, mode: Any, tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_oracle_reads_our_packets(sensor: str, mode: Any, tmp_path: Path, rng: np.random.Generator) -> None:
     table = oracle_table(sensor, tmp_path)
     packets = Encoder(sensor, return_mode=mode).encode(spin(sensor, rng, dual=mode == "dual"))
     matched = match(table, packets)
     assert matched.intensity_differs == 0
-    check(matched, sensor_info(sensor).distance_unit_um, capsys, f"encoded {sensor} {mode}")
+    check(matched, sensor_info(sensor).distance_unit_um, f"encoded {sensor} {mode}")
 
 
 @pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("mode", ["strongest", "dual"])
 def test_the_oracle_reads_our_packets_of_hdl64e_units(
-    unit: str, mode: Any, tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
+    unit: str, mode: Any, tmp_path: Path, rng: np.random.Generator
 ) -> None:
     """Real units' tables: all corrections, near and far, rotation and offsets."""
     sensor = "hdl-64e-s3" if "S3" in unit else "hdl-64e-s2"
@@ -197,10 +193,10 @@ def test_the_oracle_reads_our_packets_of_hdl64e_units(
     packets = Encoder(sensor, return_mode=mode, calibration=table).encode(
         spin(sensor, rng, dual=mode == "dual", turns_hz=12.5)
     )
-    check(match(table, packets, vd.Calibration.read(str(path))), 2000, capsys, f"encoded {unit} {mode}")
+    check(match(table, packets, vd.Calibration.read(str(path))), 2000, f"encoded {unit} {mode}")
     written = tmp_path / "ours.yaml"
     write_calibration(table, written)
-    check(match(table, packets, vd.Calibration.read(str(written))), 2000, capsys, "")
+    check(match(table, packets, vd.Calibration.read(str(written))), 2000, "")
 
 
 def rows_elevation(sensor: str) -> FloatArray:
@@ -246,9 +242,7 @@ def row_errors(firings: Firings, packets: list[bytes], calibration: Any) -> tupl
     )
 
 
-def test_64_rows_through_the_record_in_the_stream(
-    tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_64_rows_through_the_record_in_the_stream(tmp_path: Path, rng: np.random.Generator) -> None:
     """The oracle knows nothing but the packets: it finds the table in their last two bytes."""
     firings = columns_of(2170, 6 * 4200, 1.0, rng)
     table = Calibration.of_rows(rows_elevation("hdl-32e"), 2170)
@@ -261,10 +255,7 @@ def test_64_rows_through_the_record_in_the_stream(
         model, calibration = vd.hdl64e.read_calibration_from_pcap(file)
     assert model == vd.Model.HDL64E_S3
     ranges, azimuth, elevation = row_errors(firings, packets[:400], calibration)
-    with capsys.disabled():
-        print(
-            f"\n64 rows: range {ranges * 1e3:.3f} mm, azimuth {azimuth:.4f} deg, elevation {elevation:.4f} deg", end=""
-        )
+    print(f"64 rows: range {ranges * 1e3:.3f} mm, azimuth {azimuth:.4f} deg, elevation {elevation:.4f} deg")
     assert ranges <= COUNT * 0.002
     assert azimuth <= ANGLE_DEG + 1e-4  # rounded twice to 0.01 degrees, then to float32
     assert elevation <= ANGLE_DEG
@@ -277,9 +268,7 @@ def test_64_rows_through_the_record_in_the_stream(
 
 
 @pytest.mark.parametrize("turn_columns", [2170, 1085])
-def test_64_rows_at_other_speeds(
-    turn_columns: int, tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_64_rows_at_other_speeds(turn_columns: int, tmp_path: Path, rng: np.random.Generator) -> None:
     """The table takes back the turn at nominal speed; at another the rows spread by the share of it."""
     table = Calibration.of_rows(rows_elevation("hdl-32e"), turn_columns)
     path = tmp_path / "rows.yaml"
@@ -289,8 +278,7 @@ def test_64_rows_at_other_speeds(
         firings = columns_of(turn_columns, 6 * 300, speed, rng)
         packets = Encoder("hdl-64e-s3", calibration=table).encode(firings)
         _, azimuth, _ = row_errors(firings, packets, vd.Calibration.read(str(path)))
-        with capsys.disabled():
-            print(f"\n64 rows, {turn_columns} columns a turn, speed x {speed}: azimuth {azimuth:.4f} deg", end="")
+        print(f"64 rows, {turn_columns} columns a turn, speed x {speed}: azimuth {azimuth:.4f} deg")
         assert azimuth <= abs(speed - 1.0) * spread + ANGLE_DEG + 1e-4
 
 
@@ -339,9 +327,7 @@ CAPTURES = {
 
 
 @pytest.mark.parametrize("name", list(CAPTURES))
-def test_real_captures_beside_the_oracle(
-    name: str, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_real_captures_beside_the_oracle(name: str, data_dir: Path, tmp_path: Path) -> None:
     sensor, packets, positions = CAPTURES[name]
     payloads = [datagram.payload for datagram in PacketReader(data_dir / "packets" / name)]
     decoder = Decoder()
@@ -355,18 +341,15 @@ def test_real_captures_beside_the_oracle(
     used = [p for k, p in enumerate(payloads) if k not in jumps and len(p) == 1206]
     matched = match(oracle_table(sensor, tmp_path), used)
     assert matched.intensity_differs == 0
-    check(
-        matched, sensor_info(sensor).distance_unit_um, capsys, f"real {name}, {len(jumps)} packets with a jump left out"
-    )
+    check(matched, sensor_info(sensor).distance_unit_um, f"real {name}, {len(jumps)} packets with a jump left out")
 
 
 @pytest.mark.parametrize("sensor", ["hdl-32e", "vlp-32c", "vlp-16"])
-def test_our_nominal_tables_beside_the_oracles(sensor: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_our_nominal_tables_beside_the_oracles(sensor: str, tmp_path: Path) -> None:
     """Angles agree; heights of the lasers' origins are at most 20 mm apart: the oracle's 32-beam sensors have some."""
     ours, theirs = Calibration.nominal(sensor), oracle_table(sensor, tmp_path)
     height = np.abs(ours.column("vertical_offset_um") - theirs.column("vertical_offset_um")).max()
-    with capsys.disabled():
-        print(f"\nnominal {sensor}: heights of origins differ by up to {height * 1e-3:.2f} mm", end="")
+    print(f"nominal {sensor}: heights of origins differ by up to {height * 1e-3:.2f} mm")
     for name in ("elevation_mdeg", "azimuth_offset_mdeg"):
         assert np.max(np.abs(ours.column(name) - theirs.column(name))) <= 4  # 0.004 degrees
     np.testing.assert_array_equal(ours.column("laser_id"), theirs.column("laser_id"))
@@ -394,14 +377,13 @@ def foreign(path: Path, ring: str, unit_m: float) -> tuple[FloatArray, NDArray[n
     return xyz, cloud[ring].astype(np.int64) << 20 | counts, dict(cloud)
 
 
-def report(capsys: pytest.CaptureFixture[str], name: str, errors: FloatArray) -> float:
+def report(name: str, errors: FloatArray) -> float:
     p50, p99, top = np.percentile(errors, [50, 99, 100]) * 1e3
-    with capsys.disabled():
-        print(f"\n{name}: {len(errors)} points, p50 {p50:.1f} mm, p99 {p99:.1f} mm, max {top:.1f} mm", end="")
+    print(f"{name}: {len(errors)} points, p50 {p50:.1f} mm, p99 {p99:.1f} mm, max {top:.1f} mm")
     return float(p99)
 
 
-def test_vlp32c_beside_third_party_clouds(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_vlp32c_beside_third_party_clouds(data_dir: Path) -> None:
     """Both differ by the turn while firing: one driver leaves it out, the other takes it twice, a packet's last block's
     not at all."""
     folder = data_dir / "packets" / "velodyne_vlp32c"
@@ -411,16 +393,16 @@ def test_vlp32c_beside_third_party_clouds(data_dir: Path, capsys: pytest.Capture
     full, keys, _ = foreign(folder / "decoded_full_fields.pcd", "channel", 0.004)
     bare = read_pcd(folder / "decoded_xyz.pcd")
     bare_xyz = np.stack([bare[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    assert report(capsys, "vlp-32c, cloud with fields", nearest(full, keys, table, firings)) <= 30.0
-    assert report(capsys, "vlp-32c, cloud of xyz", nearest(bare_xyz, keys, table, firings)) <= 30.0
+    assert report("vlp-32c, cloud with fields", nearest(full, keys, table, firings)) <= 30.0
+    assert report("vlp-32c, cloud of xyz", nearest(bare_xyz, keys, table, firings)) <= 30.0
     still = replace(firings, rate_mdeg_s=np.zeros_like(firings.rate_mdeg_s))
     last = np.arange(len(firings)) % 12 == 11
     twice = replace(firings, rate_mdeg_s=np.where(last, 0, 2 * firings.rate_mdeg_s).astype(np.uint32))
-    assert report(capsys, "  without firing times", nearest(full, keys, table, still)) <= 3.0
-    assert report(capsys, "  with firing times as it takes them", nearest(bare_xyz, keys, table, twice)) <= 10.0
+    assert report("  without firing times", nearest(full, keys, table, still)) <= 3.0
+    assert report("  with firing times as it takes them", nearest(bare_xyz, keys, table, twice)) <= 10.0
 
 
-def test_vlp16_dual_beside_a_third_party_cloud(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_vlp16_dual_beside_a_third_party_cloud(data_dir: Path) -> None:
     """That driver does not turn a packet's last azimuth: it has no block behind it to tell how far."""
     folder = data_dir / "packets" / "velodyne_vlp16"
     datagrams = list(PacketReader(folder / "packets.db3"))
@@ -433,15 +415,15 @@ def test_vlp16_dual_beside_a_third_party_cloud(data_dir: Path, capsys: pytest.Ca
     place = np.arange(len(firings)) - np.searchsorted(decoded.packet, decoded.packet)  # 0..23 in its packet
     last = place >= 20  # two firings of a pair of blocks
     assert np.count_nonzero(np.isnan(nearest(xyz, keys, table, firings))) == 0
-    report(capsys, "vlp-16 dual, all", nearest(xyz, keys, table, firings))
+    report("vlp-16 dual, all", nearest(xyz, keys, table, firings))
     azimuth = firings.azimuth_mdeg.copy()
     azimuth[place >= 22] = azimuth[(place >= 20) & (place < 22)]
     rate = np.where(last, 0, firings.rate_mdeg_s).astype(np.uint32)
     repeated = replace(firings, azimuth_mdeg=azimuth, rate_mdeg_s=rate)
-    assert report(capsys, "  its omission repeated", nearest(xyz, keys, table, repeated)) <= 30.0
+    assert report("  its omission repeated", nearest(xyz, keys, table, repeated)) <= 30.0
     own = nearest(xyz, keys, table, firings[~last])
     theirs_of_last = nearest(xyz, keys, table, firings[last])
     best = np.where(np.isnan(own), np.inf, own)
     of_others = best <= np.where(np.isnan(theirs_of_last), np.inf, theirs_of_last)
     assert of_others.mean() > 0.8
-    assert report(capsys, "  without the last azimuths", own[of_others]) <= 30.0
+    assert report("  without the last azimuths", own[of_others]) <= 30.0
