@@ -76,6 +76,8 @@ def calibrate(
         raise CatalogueError(f"{device.name}: logs of tegrastats are of Jetson modules; --rows takes any device's rows")
     recording = read_log(log, interval_s)
     recording.check()
+    if recording.mean_w == 0:
+        raise MeasureError(f"{recording.source}: 0 W throughout: the sensor reads nothing")
     idle = None
     if idle_log is not None:
         idle = read_log(idle_log, interval_s)
@@ -174,7 +176,7 @@ def _checked(name: str, number: int, entry: dict[str, Any]) -> Row:
             raise CatalogueError(f"{name}: row {number}: {key}: {entry[key]!r}, expected a text")
     for key in _NUMBERS:
         value = entry[key]
-        least = 0.0 if key in ("macs", "power_w") else 1e-9
+        least = 0.0 if key == "macs" else 1e-9
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value < 1e18:
             raise CatalogueError(f"{name}: row {number}: {key}: {value!r}, expected a number of at least {least:g}")
     return Row(**entry, by_user=True)

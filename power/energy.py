@@ -38,6 +38,8 @@ __all__ = [
 ]
 
 REFERENCE_NODE_NM = 28.0
+_LEAST = 1e-9
+"""A power or time of nothing counts as this: factors stay finite."""
 LEAST_FACTOR = 1.05
 """No estimate claims to be better than this, whatever its error on few rows."""
 _UNKNOWN_POWER_FACTOR = 2.0
@@ -278,7 +280,8 @@ def _worst(factors: Iterable[float | None]) -> float | None:
 def _factor(guess: float | None, true: float) -> float | None:
     if guess is None:
         return None
-    return max(guess / true, true / guess) if guess > 0 else math.inf
+    guess, true = (max(x, _LEAST) for x in (guess, true))
+    return max(guess / true, true / guess)
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -220,6 +220,18 @@ def test_logs_at_work_and_at_rest_are_met_exactly(tmp_path, known, load):
     assert again.power_w.figure.get("W") == pytest.approx(2.0 + again.increment_w.figure.get("W"), rel=1e-9)
 
 
+def test_rows_that_contradict_the_model_stay_finite(known, load):
+    """A device that draws less at work than its family's dynamic power alone: errors are large, not infinite."""
+    (row,) = [r for r in known.model.rows if r.device == "jetson-orin-nx" and not r.is_idle]
+    rows = [dataclasses.replace(row, power_w=0.001, by_user=True)]
+    changed = with_rows(known, rows)
+    for one in (
+        estimate_macs(device("jetson-orin-nx"), 1e9, 1.0, known=changed),
+        estimate_load(device("jetson-orin-nx"), load, known=changed),
+    ):
+        sound(one)
+
+
 def test_logs_that_cannot_calibrate(tmp_path, known, load):
     nano = device("jetson-nano")
     good = log(tmp_path, "a.log", [2400] * 20)
@@ -227,6 +239,8 @@ def test_logs_that_cannot_calibrate(tmp_path, known, load):
         calibrate(nano, log(tmp_path, "s.log", [2400] * 9), Work(load), known=known)
     with pytest.raises(CatalogueError, match="logs of tegrastats are of Jetson modules"):
         calibrate(device("ecp5-25"), good, Work(load), known=known)
+    with pytest.raises(MeasureError, match="the sensor reads nothing"):
+        calibrate(nano, log(tmp_path, "z.log", [0] * 20), Work(load), known=known)
     other = tmp_path / "o.log"
     other.write_text("\n".join(["CPU 300/0 SOC 200/0"] * 20))
     with pytest.raises(MeasureError, match="sum of 2 rails"):
