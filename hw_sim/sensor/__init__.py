@@ -1,0 +1,24 @@
+"""The simulated sensor: packets of an HDL-32E, VLP-32C or VLP-16, on a bench's clock or as UDP in real time."""
+
+from .datagram import DATA_PORT, POSITION_PORT, Datagram, blocks, is_data, is_position
+from .motor import Motor
+from .simulated import SENSORS, SensorConfig, SimulatedSensor, merge
+from .sources import FiringSource, QuickRoom, Returns, ScanLoop
+
+__all__ = [
+    "DATA_PORT",
+    "POSITION_PORT",
+    "SENSORS",
+    "Datagram",
+    "FiringSource",
+    "Motor",
+    "QuickRoom",
+    "Returns",
+    "ScanLoop",
+    "SensorConfig",
+    "SimulatedSensor",
+    "blocks",
+    "is_data",
+    "is_position",
+    "merge",
+]
