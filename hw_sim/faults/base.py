@@ -57,8 +57,11 @@ class Fault:
 class PacketFault(Fault):
     """A fault on the way from the sensor to the device, or of the sensor itself."""
 
+    lasting: ClassVar[bool] = False
+    """Leaves something behind: its step is also called after the end, and asks ``active`` itself."""
+
     def begin(self, beams: BeamTable, rng: np.random.Generator) -> Step:
-        """What the fault does, with memory of its own; called while active only."""
+        """What the fault does, with memory of its own; called while active only, unless ``lasting``."""
         raise NotImplementedError
 
 
@@ -152,9 +155,13 @@ def _apply(
     waiting: list[tuple[int, int, Datagram]] = []
     number = count()
     for datagram in stream:
-        for made in step(datagram) if one.active(datagram.time_ns) else (datagram,):
+        for made in step(datagram) if _acts(one, datagram.time_ns) else (datagram,):
             heapq.heappush(waiting, (made.time_ns, next(number), made))
         while waiting and waiting[0][0] <= datagram.time_ns:
             yield heapq.heappop(waiting)[2]
     while waiting:
         yield heapq.heappop(waiting)[2]
+
+
+def _acts(one: PacketFault, time_ns: int) -> bool:
+    return one.active(time_ns) or (one.lasting and time_ns >= one.until_s * 1e9)

@@ -1,4 +1,4 @@
-"""Faults of the network between sensor and device: datagrams lost, late, doubled, damaged, and ones nobody asked for."""
+"""Faults of the network between sensor and device: datagrams lost, late, doubled, damaged, and foreign ones."""
 
 from __future__ import annotations
 

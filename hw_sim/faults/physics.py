@@ -75,8 +75,8 @@ class FogOptics:
     ``beta = 0.046 / V`` per metre and steradian (Rasshofer, Spies, Spies 2011). A diffuse target of reflectivity rho at
     range R returns ``rho / pi / R^2 * exp(-2 alpha R)``; fog at range r returns
     ``beta * pulse / 2 / r^2 * exp(-2 alpha r)``, times an exponential deviate (speckle). The receiver's gain rises with
-    the square of the range up to ``full_gain_m``; what stays below the power of a 10 % target at ``reach_10_m`` in clear
-    air is lost.
+    the square of the range up to ``full_gain_m``; what stays below the power of a 10 % target at ``reach_10_m`` in
+    clear air is lost.
     """
 
     visibility_m: float
@@ -146,7 +146,7 @@ def fog_returns(
     optics: FogOptics, counts: NDArray[np.uint16], intensity: NDArray[np.uint8], unit_m: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     """Clear-air returns as the sensor would have seen them in fog."""
-    metres = counts * unit_m
+    metres = counts.astype(np.float64) * unit_m
     hard = optics.received(metres, np.maximum(intensity, 1) / 100.0)
     fog_m, soft = optics.backscatter(counts.shape, rng)
     # Fog behind a target is not lit.

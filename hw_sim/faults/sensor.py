@@ -46,7 +46,7 @@ def beam_cells(beams: BeamTable, beam: int) -> list[int]:
 @fault("sensor", "stuck_azimuth")
 @dataclass(frozen=True, kw_only=True)
 class StuckAzimuth(PacketFault):
-    """The encoder stands still while the sensor turns and fires on: every block has the azimuth of the first one hit."""
+    """The encoder stands still while the sensor turns and fires on: every block has the first one's azimuth."""
 
     def begin(self, beams: BeamTable, rng: np.random.Generator) -> Step:
         held: int | None = None
@@ -82,27 +82,29 @@ class AzimuthJump(PacketFault):
 class Rpm(PacketFault):
     """The motor runs at ``scale`` times its speed: azimuths advance by that, the firing cycle stays.
 
-    What the lasers see is not turned along: the speed is the fault, the scene is of no matter.
+    What the lasers see is not turned along: the speed is the fault, the scene is of no matter. At its end the azimuth
+    goes on from where it is.
     """
+
+    lasting = True
 
     scale: float = 0.8
 
     def begin(self, beams: BeamTable, rng: np.random.Generator) -> Step:
         self.within("scale", 0.1, 3)
         last: int | None = None
-        ahead = 0
+        turned = 0
 
-        def change(packet: NDArray[Any]) -> None:
-            nonlocal last, ahead
+        def change(packet: NDArray[Any], active: bool) -> None:
+            nonlocal last, turned
             azimuth = packet["blocks"]["azimuth"][0].astype(np.int64)
-            before = azimuth[0] if last is None else last
-            steps = np.diff(azimuth, prepend=before) % 36000
-            total = ahead + np.cumsum(steps)
-            ahead, last = int(total[-1]), int(azimuth[-1])
+            steps = np.diff(azimuth, prepend=azimuth[0] if last is None else last) % 36000
+            total = turned + np.cumsum(steps) * active
+            turned, last = int(total[-1]), int(azimuth[-1])
             extra = np.floor(total * (self.scale - 1) + 0.5).astype(np.int64)
             packet["blocks"]["azimuth"][0] = (azimuth + extra) % 36000
 
-        return lambda datagram: (edit(datagram, change),)
+        return lambda datagram: (edit(datagram, lambda packet: change(packet, self.active(datagram.time_ns))),)
 
 
 @fault("sensor", "dead_laser")
