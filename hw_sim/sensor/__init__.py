@@ -4,6 +4,7 @@ from .datagram import DATA_PORT, POSITION_PORT, Datagram, blocks, is_data, is_po
 from .motor import Motor
 from .simulated import SENSORS, SensorConfig, SimulatedSensor, merge
 from .sources import FiringSource, QuickRoom, Returns, ScanLoop
+from .udp import SendReport, send_udp
 
 __all__ = [
     "DATA_PORT",
@@ -15,10 +16,12 @@ __all__ = [
     "QuickRoom",
     "Returns",
     "ScanLoop",
+    "SendReport",
     "SensorConfig",
     "SimulatedSensor",
     "blocks",
     "is_data",
     "is_position",
     "merge",
+    "send_udp",
 ]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from upbeam.model.beams import beam_table
+from functools import lru_cache
+from upbeam.model.beams import beam_table as _bt
+beam_table = lru_cache(_bt)
 
 from .datagram import PACKET
 from .sources import Returns

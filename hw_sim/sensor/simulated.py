@@ -8,6 +8,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ __all__ = ["SENSORS", "SensorConfig", "SimulatedSensor", "merge"]
 SENSORS = {"hdl-32e": 12, "vlp-32c": 12, "vlp-16": 24}
 """Sensors that can be simulated, and firings in a packet with one return."""
 _HOUR_US = 3_600_000_000
+_table = lru_cache(maxsize=None)(beam_table)
 _CHUNK_PACKETS = 8
 """Packets made at once: enough to pay for the array calls, short enough for a sender in real time."""
 
@@ -69,7 +71,7 @@ class SensorConfig:
 
     @property
     def beams(self) -> BeamTable:
-        return beam_table(self.model)
+        return _table(self.model)
 
     @property
     def firing_ns(self) -> float:
