@@ -40,7 +40,7 @@ class Loss(PacketFault):
 class BurstLoss(PacketFault):
     """Losses in bursts: the two-state chain of Gilbert and Elliott, stepped once a datagram."""
 
-    enter: float = 0.005
+    enter: float = 0.01
     """Chance to go from the good state to the bad one."""
     leave: float = 0.1
     """Chance to go back; bursts last 1 / leave datagrams on average."""

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from functools import lru_cache
 from upbeam.model.beams import beam_table as _bt
+
 beam_table = lru_cache(_bt)
 
 from .datagram import PACKET
