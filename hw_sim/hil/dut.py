@@ -1,0 +1,174 @@
+"""The device under test as the bench sees it: bytes and times in, bytes and times out, and what can be done to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from upbeam.hw_sim.can import CanFrame
+from upbeam.hw_sim.sensor import DATA_PORT, POSITION_PORT, Datagram
+from upbeam.runtime.daemon import Daemon
+from upbeam.runtime.upsampler import load_model
+
+__all__ = ["DATA_SOURCE", "Dut", "InProcessDut", "NotPossibleError", "Output"]
+
+DATA_SOURCE = 0xC0A801C9
+"""192.168.1.201, where Velodyne sensors send from."""
+KEY = bytes(range(16))
+"""Of the bench's commands."""
+
+
+class NotPossibleError(Exception):
+    """This device cannot do what a scenario asks of it: the scenario is not run on it, and counted so."""
+
+
+class Output(NamedTuple):
+    """Something that left the device."""
+
+    kind: str
+    """column_stream, hdl64, can, serial, ledger or event."""
+    time_ns: int
+    """Of the bench's clock."""
+    payload: Any
+    """Bytes; of can a ``CanFrame``; of ledger and event a dict by the fields of the C structs."""
+
+
+class Dut(Protocol):
+    """A device under test. Times are the bench's, never falling."""
+
+    name: str
+    virtual: bool
+    """Whether time is what the bench says."""
+    can_do: frozenset[str]
+    """Disturbances it knows (``DeviceFault``)."""
+
+    def power_on(self, time_ns: int) -> None: ...
+
+    def power_off(self, time_ns: int) -> dict[str, Any]:
+        """Cuts the supply; gives the last status."""
+        ...
+
+    def datagram(self, datagram: Datagram) -> None: ...
+
+    def can(self, frame: CanFrame, time_ns: int) -> None: ...
+
+    def serial(self, data: bytes, time_ns: int) -> None: ...
+
+    def tick(self, time_ns: int) -> None:
+        """Time passes."""
+        ...
+
+    def bus_off(self, off: bool) -> None:
+        """Whether its CAN controller takes no frames."""
+        ...
+
+    def disturb(self, what: str, settings: dict[str, Any] | None) -> None:
+        """Begins a disturbance, or ends it (None)."""
+        ...
+
+    def swap_model(self, ubm: bytes, time_ns: int) -> None: ...
+
+    def take(self) -> list[Output]:
+        """What has left since the last call."""
+        ...
+
+    def status(self) -> dict[str, Any]:
+        """Counters and state, the names of ``upb_daemon_status`` and ``upb_daemon_counters``."""
+        ...
+
+    def end(self, time_ns: int) -> None:
+        """A clean end."""
+        ...
+
+
+@dataclass
+class InProcessDut:
+    """The daemon's core in this process, on virtual time."""
+
+    settings: Mapping[str, Any]
+    """Fields of ``upb_daemon_config``, and ``model``: the name of a shipped model."""
+    sabotage: str | None = None
+    """Name of a detection or reaction that is taken out."""
+    storage: dict[int, bytes] = field(default_factory=dict)
+    """What survives a power cut."""
+    name: str = "inprocess"
+    virtual: bool = True
+    can_do: frozenset[str] = frozenset({"bit_flip", "slow_down", "bus_off", "wrong_crc", "serial_noise", "reset"})
+    _daemon: Daemon | None = None
+    _service_ns: Sequence[int] = ()
+
+    def power_on(self, time_ns: int) -> None:
+        settings = dict(self.settings)
+        model = str(settings.pop("model", "vlp-32c"))
+        settings.setdefault("sensor", "vlp-32c")
+        if self.sabotage is not None:
+            settings["sabotage"] = [self.sabotage]
+        self._daemon = Daemon(load_model(model).data, key=KEY, storage=self.storage, **settings)
+        self._service_ns = list(self._daemon.service_ns)
+        self._daemon.tick(time_ns)
+
+    def power_off(self, time_ns: int) -> dict[str, Any]:
+        status = self.status()
+        self._daemon = None
+        return status
+
+    @property
+    def daemon(self) -> Daemon:
+        """Raises RuntimeError while it has no power."""
+        if self._daemon is None:
+            raise RuntimeError("the device has no power")
+        return self._daemon
+
+    def datagram(self, datagram: Datagram) -> None:
+        if datagram.port == DATA_PORT:
+            self.daemon.packet(datagram.payload, DATA_SOURCE, datagram.time_ns)
+        elif datagram.port == POSITION_PORT:
+            self.daemon.position(datagram.payload, DATA_SOURCE, datagram.time_ns)
+
+    def can(self, frame: CanFrame, time_ns: int) -> None:
+        flags = frame.fd | frame.bit_rate_switch << 1 | frame.extended << 2
+        self.daemon.can(frame.identifier, flags, frame.data, time_ns)
+
+    def serial(self, data: bytes, time_ns: int) -> None:
+        self.daemon.serial(data, time_ns)
+
+    def tick(self, time_ns: int) -> None:
+        self.daemon.tick(time_ns)
+
+    def bus_off(self, off: bool) -> None:
+        self.daemon.can_state = "failed" if off else "ok"
+
+    def disturb(self, what: str, settings: dict[str, Any] | None) -> None:
+        if what == "slow_down":
+            factor = settings["factor"] if settings else 1.0
+            self.daemon.set_service([round(ns * factor) for ns in self._service_ns])
+        elif what == "bit_flip" and settings is not None:
+            rng = np.random.default_rng([settings["seed"], 0xB17])
+            for _ in range(settings["bits"]):
+                size = self.daemon.region_bytes(settings["region"])
+                self.daemon.flip_bit(settings["region"], int(rng.integers(8 * size)))
+        else:
+            raise NotPossibleError(f"{self.name}: cannot do {what}")
+
+    def swap_model(self, ubm: bytes, time_ns: int) -> None:
+        self.daemon.swap_model(ubm, time_ns)
+
+    def take(self) -> list[Output]:
+        out = []
+        for kind, time_ns, payload in self.daemon.take():
+            if kind == "can":
+                identifier, flags, data = payload
+                payload = CanFrame(
+                    identifier, data, extended=bool(flags & 4), fd=bool(flags & 1), bit_rate_switch=bool(flags & 2)
+                )
+            out.append(Output(kind, time_ns, payload))
+        return out
+
+    def status(self) -> dict[str, Any]:
+        return self.daemon.status()
+
+    def end(self, time_ns: int) -> None:
+        self.daemon.end(time_ns)
