@@ -202,7 +202,7 @@ def _shift_clock(datagram: Datagram, shift_us: int) -> Datagram:
 
     if is_position(datagram):
         return datagram._replace(
-            payload=change_position(datagram.payload, lambda p: {"time_us": (p["time_us"] + shift_us) % _HOUR_US})
+            payload=change_position(datagram.payload, lambda p: {"time_us": (p.time_us + shift_us) % _HOUR_US})
         )
     return edit(datagram, change)
 

@@ -257,7 +257,9 @@ class Bench:
             self.dut.serial(bytes.fromhex(settings["hex"]), self.now_ns)
             self.collect()
         elif action.action == "can_frame":
-            self.send(CanFrame(settings["identifier"], bytes.fromhex(settings["hex"]), fd=settings.get("fd", False)), via)
+            self.send(
+                CanFrame(settings["identifier"], bytes.fromhex(settings["hex"]), fd=settings.get("fd", False)), via
+            )
         elif action.action.startswith("uds_"):
             self._diagnose(action.action)
         else:
@@ -279,7 +281,10 @@ class Bench:
         frame = self._build(settings, forged=action == "forged_command")
         if action == "damaged_command":
             return CanFrame(
-                frame.identifier, bytes([frame.data[0] ^ 1]) + frame.data[1:], fd=True, bit_rate_switch=frame.bit_rate_switch
+                frame.identifier,
+                bytes([frame.data[0] ^ 1]) + frame.data[1:],
+                fd=True,
+                bit_rate_switch=frame.bit_rate_switch,
             )
         if action == "command":
             self._last_command = frame

@@ -238,7 +238,9 @@ def _expected_reaction(table: dict[str, Any], span: tuple[float, float]) -> Expe
     does = str(table["does"])
     if does not in REACTIONS:
         raise ValueError(f"expect.reaction: does {does!r}: expected one of {', '.join(REACTIONS)}")
-    return ExpectedReaction(does, float(table.get("after_s", span[0])), float(table["within_ms"]), str(table.get("to", "")))
+    return ExpectedReaction(
+        does, float(table.get("after_s", span[0])), float(table["within_ms"]), str(table.get("to", ""))
+    )
 
 
 def _limits(key: str, value: Any) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from .datagram import DATA_PORT, POSITION_PORT, Datagram, blocks, is_data, is_position
 from .motor import Motor
+from .recording import RecordedSensor
 from .simulated import SENSORS, SensorConfig, SimulatedSensor, merge
 from .sources import FiringSource, QuickRoom, Returns, ScanLoop
 from .udp import SendReport, send_udp
@@ -14,6 +15,7 @@ __all__ = [
     "FiringSource",
     "Motor",
     "QuickRoom",
+    "RecordedSensor",
     "Returns",
     "ScanLoop",
     "SendReport",

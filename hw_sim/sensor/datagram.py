@@ -1,11 +1,17 @@
-"""What travels from a sensor to the device: UDP datagrams with the moment they leave, and a view into data packets."""
+"""What travels from a sensor to the device: UDP datagrams, and a view into data packets.
+
+On the bench a datagram's time is when it leaves, in nanoseconds of the bench's clock, which starts at 0 with the
+sensor. Its port is ``DATA_PORT`` or ``POSITION_PORT`` unless a fault chose another.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from upbeam.runtime.packets import Datagram
 
 __all__ = ["DATA_BYTES", "DATA_PORT", "POSITION_BYTES", "POSITION_PORT", "Datagram", "blocks", "is_data", "is_position"]
 
@@ -19,16 +25,6 @@ BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("returns", [("distance",
 TAIL = np.dtype([("toh_us", "<u4"), ("return_mode", "u1"), ("model", "u1")])
 """What follows the blocks: microseconds since the hour, return mode, model."""
 PACKET = np.dtype([("blocks", BLOCK, (12,)), ("tail", TAIL)])
-
-
-class Datagram(NamedTuple):
-    """One UDP payload at the moment it is sent."""
-
-    time_ns: int
-    """Nanoseconds of the bench's clock, which starts at 0 with the sensor."""
-    port: int
-    """Destination: ``DATA_PORT`` or ``POSITION_PORT`` unless a fault chose another."""
-    payload: bytes
 
 
 def is_data(datagram: Datagram) -> bool:

@@ -1,62 +1,48 @@
-"""Firings to payloads."""
+"""Firings to payloads, by the codec of the runtime."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from functools import lru_cache
-from upbeam.model.beams import beam_table as _bt
+from upbeam.runtime.packets import SECOND, Encoder, Firings, Position
 
-beam_table = lru_cache(_bt)
-
-from .datagram import PACKET
 from .sources import Returns
 
-__all__ = ["RETURN_MODES", "encode_firings", "encode_position"]
+__all__ = ["change_position", "encode_chunk", "encode_position"]
 
-RETURN_MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
-_MODELS = {"hdl-32e": 0x21, "vlp-16": 0x22, "vlp-32c": 0x28}
+_PPS_LOCKED = 2
 
 
-def encode_firings(
-    model: str, returns: str, azimuth_mdeg: NDArray[np.int64], distance: NDArray[np.uint16],
-    intensity: NDArray[np.uint8], last: Returns | None, toh_us: int,
-) -> bytes:  # fmt: skip
-    packet = np.zeros((), dtype=PACKET)
-    b = packet["blocks"]
-    b["flag"] = 0xEEFF
-    slot = beam_table(model).laser_id.astype(int)
-    if model == "vlp-16":
-        cells = np.concatenate([slot, slot + 16])
-        distance, intensity = distance.reshape(-1, 32), intensity.reshape(-1, 32)
-        azimuth_mdeg = azimuth_mdeg[::2]
-        if last is not None:
-            last = Returns(last.distance.reshape(-1, 32), last.intensity.reshape(-1, 32))
-        slot = cells
-    planes = [(distance, intensity)] if last is None else [(last.distance, last.intensity), (distance, intensity)]
-    for k, (d, i) in enumerate(planes):
-        part = b[k :: len(planes)]
-        part["azimuth"] = azimuth_mdeg // 10
-        part["returns"]["distance"][:, slot] = d
-        part["returns"]["intensity"][:, slot] = i
-    packet["tail"] = (toh_us, RETURN_MODES[returns], _MODELS[model])
-    return packet.tobytes()
+def encode_chunk(
+    encoder: Encoder, time_ns: NDArray[np.int64], azimuth_mdeg: NDArray[np.int64], seen: Returns, last: Returns | None
+) -> list[bytes]:
+    """Packets of firings that fill a whole number of them; ``last``: their other returns, in dual return."""
+    distance, intensity, flags = seen.distance, seen.intensity, np.zeros(len(time_ns), np.uint16)
+    if last is not None:
+        distance = _interleave(distance, last.distance)
+        intensity = _interleave(intensity, last.intensity)
+        flags = np.tile(np.array([0, SECOND], np.uint16), len(time_ns))
+        time_ns, azimuth_mdeg = np.repeat(time_ns, 2), np.repeat(azimuth_mdeg, 2)
+    return encoder.encode(Firings.of(distance, intensity, azimuth_mdeg=azimuth_mdeg, time_ns=time_ns, flags=flags))
+
+
+def _interleave(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
+    return np.stack([first, second], axis=1).reshape(-1, first.shape[1])
 
 
 def encode_position(toh_us: int) -> bytes:
-    payload = bytearray(512)
-    payload[198:202] = toh_us.to_bytes(4, "little")
-    payload[202] = 2
-    return bytes(payload)
+    """A position packet of a healthy sensor."""
+    return Position(time_us=toh_us, pps=_PPS_LOCKED).encode()
 
 
-def change_position(payload, change):
-    out = bytearray(payload)
-    now = {"time_us": int.from_bytes(payload[198:202], "little"), "pps": payload[202]}
-    new = change(now)
-    if "time_us" in new:
-        out[198:202] = new["time_us"].to_bytes(4, "little")
-    if "pps" in new:
-        out[202] = new["pps"]
-    return bytes(out)
+def change_position(
+    payload: bytes, change: Callable[[Position], dict[Literal["time_us", "pps", "thermal_shutdown"], int]]
+) -> bytes:
+    """The position packet with fields changed; ``change`` gives the new ones."""
+    position = Position.decode(payload)
+    return replace(position, **change(position)).encode()

@@ -9,14 +9,15 @@ import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from upbeam.model.beams import BeamTable, beam_table
+from upbeam.runtime.packets import Encoder
 
 from .datagram import DATA_PORT, POSITION_PORT, Datagram
-from .encoding import RETURN_MODES, encode_firings, encode_position
+from .encoding import encode_chunk, encode_position
 from .motor import Motor
 from .sources import FiringSource, QuickRoom, Returns
 
@@ -24,6 +25,7 @@ __all__ = ["SENSORS", "SensorConfig", "SimulatedSensor", "merge"]
 
 SENSORS = {"hdl-32e": 12, "vlp-32c": 12, "vlp-16": 24}
 """Sensors that can be simulated, and firings in a packet with one return."""
+RETURN_MODES = ("strongest", "last", "dual")
 _HOUR_US = 3_600_000_000
 _table = lru_cache(maxsize=None)(beam_table)
 _CHUNK_PACKETS = 8
@@ -43,8 +45,7 @@ class SensorConfig:
     columns: int | None = None
     """Firings per turn at the nominal speed. None: what the sensor's firing cycle gives. Set for stress only: real
     sensors do not fire faster."""
-    returns: str = "strongest"
-    """"strongest", "last" or "dual"."""
+    returns: Literal["strongest", "last", "dual"] = "strongest"
     start_azimuth_deg: float = 0.0
     """Clockwise; a start that is not the cut begins with a partial turn, as real streams do."""
     start_toh_us: int = 0
@@ -63,7 +64,7 @@ class SensorConfig:
         if self.columns is not None and not 16 <= self.columns <= 65535:
             raise ValueError(f"columns {self.columns}: expected 16 to 65535, or None for the sensor's own")
         if self.returns not in RETURN_MODES:
-            raise ValueError(f"returns {self.returns!r}: expected one of {', '.join(RETURN_MODES)}")
+            raise ValueError(f"returns {self.returns!r}: expected {', '.join(RETURN_MODES)}")
         if not 0 <= self.start_toh_us < _HOUR_US:
             raise ValueError(f"start_toh_us {self.start_toh_us}: expected 0 to {_HOUR_US - 1}")
         if not 0 <= self.position_hz <= 1000 or self.latency_ns < 0:
@@ -117,33 +118,25 @@ class SimulatedSensor:
 
     def _data(self) -> Iterator[Datagram]:
         config = self.config
-        per_packet = config.firings_per_packet
+        per_packet, firing_ns = config.firings_per_packet, config.firing_ns
+        encoder = Encoder(config.model, return_mode=config.returns)
+        span_ns = round(per_packet * firing_ns) + config.latency_ns
         first = 0
         while True:
-            firing = np.arange(first, first + per_packet * _CHUNK_PACKETS + 1, dtype=np.int64)
-            start_ns = np.floor(firing * config.firing_ns)
+            count = per_packet * _CHUNK_PACKETS
+            firing = np.arange(first, first + count + 1, dtype=np.int64)
+            start_ns = np.floor(firing * firing_ns).astype(np.int64)
             turns = self.motor.turns(start_ns * 1e-9)
+            # A sensor truncates its encoder's angle to hundredths of a degree.
+            azimuth = np.floor((turns[:-1] % 1.0) * 36000).astype(np.int64) % 36000 * 10
             seen = self.source.returns(turns, firing)
-            for k in range(0, per_packet * _CHUNK_PACKETS, per_packet):
-                yield self._packet(int(start_ns[k]), turns[k : k + per_packet], seen, k)
-            first += per_packet * _CHUNK_PACKETS
-
-    def _packet(self, start_ns: int, turns: NDArray[np.float64], seen: Returns, k: int) -> Datagram:
-        config = self.config
-        span = slice(k, k + config.firings_per_packet)
-        # A sensor truncates its encoder's angle to hundredths of a degree.
-        azimuth = np.floor((turns % 1.0) * 36000).astype(np.int64) % 36000 * 10
-        payload = encode_firings(
-            config.model,
-            config.returns,
-            azimuth,
-            seen.distance[span],
-            seen.intensity[span],
-            _last_returns(seen, span) if config.returns == "dual" else None,
-            self.toh_us(start_ns),
-        )
-        ready = start_ns + round(config.firings_per_packet * config.firing_ns) + config.latency_ns
-        return Datagram(ready, DATA_PORT, payload)
+            last = _last_returns(seen) if config.returns == "dual" else None
+            seen = Returns(seen.distance[:-1], seen.intensity[:-1])
+            clock_ns = (config.start_toh_us * 1000 + start_ns[:-1]) % (_HOUR_US * 1000)
+            payloads = encode_chunk(encoder, clock_ns, azimuth, seen, last)
+            for leaves_ns, payload in zip(start_ns[:-1:per_packet] + span_ns, payloads, strict=True):
+                yield Datagram(int(leaves_ns), DATA_PORT, payload)
+            first += count
 
     def _positions(self) -> Iterator[Datagram]:
         config = self.config
@@ -158,13 +151,12 @@ class SimulatedSensor:
         return (self.config.start_toh_us + time_ns // 1000) % _HOUR_US
 
 
-def _last_returns(seen: Returns, span: slice) -> Returns:
-    """Where the next firing sees something at least 1 m deeper the beam's spot lies on both: the last return is the
-    deeper one. Elsewhere there is one return, sent twice."""
-    near, deep = seen.distance[span], seen.distance[span.start + 1 : span.stop + 1]
+def _last_returns(seen: Returns) -> Returns:
+    """Of all firings but the last. Where the next firing sees something at least 500 counts deeper the beam's spot
+    lies on both: the last return is the deeper one. Elsewhere there is one return, sent twice."""
+    near, deep = seen.distance[:-1], seen.distance[1:]
     both = (near > 0) & (deep.astype(np.int64) - near > 500)
-    later = seen.intensity[span.start + 1 : span.stop + 1]
-    return Returns(np.where(both, deep, near), np.where(both, later, seen.intensity[span]))
+    return Returns(np.where(both, deep, near), np.where(both, seen.intensity[1:], seen.intensity[:-1]))
 
 
 def merge(*streams: Iterator[Datagram]) -> Iterator[Datagram]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from itertools import islice, pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from upbeam.hw_sim.sensor import (
     SENSORS,
     Motor,
     QuickRoom,
+    RecordedSensor,
     ScanLoop,
     SensorConfig,
     SimulatedSensor,
@@ -211,3 +213,59 @@ def test_udp_sends_everything_and_says_how_late() -> None:
     assert report.datagrams == len(stream)
     assert report.refused == 0
     assert 0 <= report.late_p50_us <= report.late_p99_us <= report.late_max_us
+
+
+# ------------------------------------------------------------------------------------------------------- recordings
+
+
+def test_a_recording_is_played_without_a_seam() -> None:
+    """Twice round: payloads as recorded but for the clock, which goes on; azimuths step at the seam as elsewhere."""
+    made = list(SimulatedSensor(SensorConfig(start_toh_us=HOUR_US - 60_000)).until(175_000_000))
+    recorded = RecordedSensor([d.payload for d in made])
+    assert recorded.loop_s == pytest.approx(0.15, abs=0.001)
+    played = list(recorded.until(round(2.5 * recorded.loop_s * 1e9)))
+    payloads = [d.payload for d in made if is_data(d)]
+    loop = round(recorded.loop_s * 1e9 / 663_552)
+    for k, datagram in enumerate(played):
+        assert datagram.payload[:1200] == payloads[k % loop][:1200]
+        assert datagram.payload[1204:] == payloads[k % loop][1204:]
+    clock = np.array([int(blocks(d.payload)["tail"]["toh_us"][0]) for d in played])
+    steps = np.diff(clock) % HOUR_US
+    assert np.all(np.abs(steps - 663.552) <= 2)
+    assert np.array_equal(steps * 1000, np.diff([d.time_ns for d in played]))
+    azimuth = np.concatenate([blocks(d.payload)["blocks"]["azimuth"][0] for d in played]).astype(int)
+    assert np.max(np.diff(azimuth) % 36000) <= 300
+
+
+def test_a_recordings_clock_can_be_set() -> None:
+    made = [d.payload for d in SimulatedSensor(SensorConfig()).until(120_000_000)]
+    first = next(iter(RecordedSensor(made, start_toh_us=1_000_000)))
+    assert int(blocks(first.payload)["tail"]["toh_us"][0]) == 1_000_000
+
+
+def test_what_is_no_recording_of_a_sensor_is_refused() -> None:
+    short = [d.payload for d in SimulatedSensor(SensorConfig()).until(20_000_000)]
+    with pytest.raises(ValueError, match="expected a whole turn"):
+        RecordedSensor(short)
+    with pytest.raises(ValueError, match="model none"):
+        RecordedSensor([b"x" * 100])
+    other = [d.payload for d in SimulatedSensor(SensorConfig(model="hdl-32e")).until(60_000_000)]
+    with pytest.raises(ValueError, match="0x21, 0x28"):
+        RecordedSensor([*short, *other])
+
+
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [("velodyne_hdl32e/sample_velodyne_hdl32.pcap", "hdl-32e"), ("velodyne_vlp32c/packets.db3", "vlp-32c")],
+)
+def test_real_recordings(data_dir: Path, name: str, model: str) -> None:
+    recorded = RecordedSensor.open(data_dir / "packets" / name)
+    assert recorded.beams.name == model
+    played = list(recorded.until(round(2.2 * recorded.loop_s * 1e9)))
+    azimuth = np.array([int(blocks(d.payload)["blocks"]["azimuth"][0, 0]) for d in played])
+    steps = np.diff(azimuth) % 36000  # the VLP-32C sends half of the turn only, and jumps over the rest
+    usual = np.median(steps)
+    loop = round(np.searchsorted([d.time_ns for d in played], recorded.loop_s * 1e9 - 1))
+    assert 100 < usual < 500
+    assert steps[loop - 1] < 2 * usual
+    assert all(a.time_ns <= b.time_ns for a, b in pairwise(played))
