@@ -39,7 +39,6 @@ class RecordedSensor:
         end = _seam(view["blocks"]["azimuth"][:, 0].astype(np.int64), self._clock_us)
         self._payloads: Sequence[bytes] = kept[:end]
         first = self._clock_us[0]
-        step = int(np.median(np.diff(self._clock_us[: end + 1])))
         self._length_us = int(self._clock_us[end] - first)
         self._shift_us = 0 if start_toh_us is None else int(start_toh_us - first)
 
