@@ -5,7 +5,8 @@ from __future__ import annotations
 import heapq
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,15 +14,14 @@ import numpy as np
 from upbeam.hw_sim.can import CanFrame, Received, SimulatedBus
 from upbeam.hw_sim.can.commander import Command, Commander, Mode
 from upbeam.hw_sim.can.database import Decoder
-from upbeam.hw_sim.can.uds import FaultMemory, VirtualConnection
+from upbeam.hw_sim.can.uds import UdsTester, VirtualConnection
 from upbeam.hw_sim.faults import DeviceFault, apply_faults
 from upbeam.hw_sim.sensor import DATA_PORT, POSITION_PORT, Datagram, RecordedSensor, SimulatedSensor
 from upbeam.hw_sim.serial.framing import RecordParser, encode_record
-from upbeam.runtime.daemon import fault_names
 from upbeam.runtime.upsampler import load_model
 
 from .dut import KEY, Dut, NotPossibleError, Output
-from .record import Boot, Done, Event, Record
+from .record import Boot, Done, Record
 from .scenario import Action, Scenario
 
 __all__ = ["TICK_NS", "Bench", "run_scenario"]
@@ -63,6 +63,8 @@ class Bench:
         self._last_command: CanFrame | None = None
         self._drops: dict[str, int] = {}
         self._bus_was_off = False
+        self._shorted = False
+        self._noise: dict[str, Any] | None = None
         self.device_node.listeners.append(self._device_hears)
         self.tester.listeners.append(self._tester_hears)
 
@@ -217,16 +219,11 @@ class Bench:
         else:
             self.dut.disturb(what, settings)
 
-    _noise: dict[str, Any] | None = None
-    _short_until: int | None = None
-
     def _short(self, on: bool) -> None:
         """A short circuit: the bus is dominant, and the device's controller counts errors until it is bus-off."""
         self._shorted = on
         if on:
             self._hold()
-
-    _shorted = False
 
     def _hold(self) -> None:
         """Holds the bus a little longer, as long as the short lasts."""
@@ -307,9 +304,12 @@ class Bench:
 
     def _diagnose(self, action: str) -> None:
         """Talks to the device; the bench's clock goes on meanwhile."""
-        connection = VirtualConnection(self.bus, self.tester, self.advance_next)
-        memory = FaultMemory(connection)
-        result: Any = memory.clear() if action == "uds_clear_faults" else [r.name for r in memory.read() if r.confirmed]
+        with UdsTester(VirtualConnection(self.bus, self.tester, self.advance_next)) as tester:
+            if action == "uds_clear_faults":
+                tester.clear()
+                result: list[str] = []
+            else:
+                result = [record.name for record in tester.faults() if record.confirmed]
         self.record.diagnostics.append((self.now_ns, action, result))
 
 
@@ -322,8 +322,7 @@ def _damaged_crc(share: float) -> Callable[[CanFrame], CanFrame]:
         if debt < 1 or not frame.data:
             return frame
         debt -= 1
-        data = bytes([frame.data[0] ^ 0x55]) + frame.data[1:]
-        return CanFrame(frame.identifier, data, frame.extended, frame.fd, frame.bit_rate_switch)
+        return replace(frame, data=bytes([frame.data[0] ^ 0x55]) + frame.data[1:])
 
     return tamper
 
@@ -339,13 +338,6 @@ def _model_file(name: str) -> bytes:
 
 def _crc_of(name: str) -> int:
     return 0xDEADBEEF if name == "unknown" else int(load_model(name).info["crc32"])
-
-
-def event_of(output: Output) -> Event:
-    """An event's numbers with their names."""
-    e = output.payload
-    name = fault_names()[e["a"]] if e["kind"] in ("fault_set", "fault_cleared", "resync") else ""
-    return Event(output.time_ns, e["kind"], e["a"], e["b"], e["value"], e["frame"], name)
 
 
 def run_scenario(scenario: Scenario, dut: Dut) -> Record:
@@ -392,8 +384,6 @@ def _plan(bench: Bench, scenario: Scenario) -> None:
     for fault in scenario.faults:
         if isinstance(fault, DeviceFault):
             for moment in fault.moments():
-                bench.at(
-                    round(moment.time_s * 1e9), lambda what=moment.what, how=moment.settings: bench.disturb(what, how)
-                )
+                bench.at(round(moment.time_s * 1e9), partial(bench.disturb, moment.what, moment.settings))
     for action in scenario.actions:
-        bench.at(round(action.at_s * 1e9), lambda action=action: bench.act(action))
+        bench.at(round(action.at_s * 1e9), partial(bench.act, action))

@@ -13,16 +13,25 @@ from upbeam.hw_sim.can import CanFrame
 from upbeam.hw_sim.can.commander import Response
 from upbeam.hw_sim.can.database import Decoded
 from upbeam.hw_sim.sensor import Datagram
-from upbeam.runtime.daemon import Columns, read_columns
 
 from .dut import Output
 
-__all__ = ["Boot", "Done", "Event", "Record"]
+__all__ = ["COLUMN", "HEADER", "Boot", "Done", "Event", "Record"]
+
+HEADER = np.dtype(
+    [("magic", "S4"), ("version", "u1"), ("header_bytes", "u1"), ("columns", "u1"), ("rows", "u1"), ("sequence", "<u4"),
+     ("model_crc32", "<u4"), ("frame", "<u8"), ("unit_um", "<u4"), ("turn_columns", "<u4")]
+)  # fmt: skip
+"""A column stream datagram's header, read from its description (docs/column-stream.md) apart from the product's."""
+COLUMN = np.dtype(
+    [("column", "<u4"), ("azimuth_mdeg", "<u4"), ("time_ns", "<u8"), ("flags", "<u4"), ("distance", "<u2", (64,)),
+     ("intensity", "u1", (64,))]
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Event:
-    """An event of the device (``upb_event``), with the names of its numbers."""
+    """An event of the device (``upb_event``)."""
 
     time_ns: int
     kind: str
@@ -30,8 +39,8 @@ class Event:
     b: int
     value: int
     frame: int
-    fault: str = ""
-    """Of a fault's event: its name."""
+    fault: str
+    """Of a fault's event: its name; else empty."""
 
 
 @dataclass(frozen=True)
@@ -92,18 +101,40 @@ class Record:
         return [output for output in self.outputs if output.kind == kind]
 
     @cached_property
-    def ledger(self) -> list[Output]:
-        return self.of_kind("ledger")
+    def events(self) -> list[Event]:
+        """The device's, in order."""
+        return [
+            Event(o.time_ns, e["kind"], e["a"], e["b"], e["value"], e["frame"], e.get("fault", ""))
+            for o in self.of_kind("event")
+            for e in [o.payload]
+        ]
 
     @cached_property
-    def columns(self) -> list[tuple[int, Columns]]:
-        """Of the column stream: when each datagram left, and what it holds."""
-        return [(output.time_ns, read_columns(output.payload)) for output in self.of_kind("column_stream")]
+    def ledger(self) -> list[dict[str, Any]]:
+        """Records of closed frames, in order."""
+        return [output.payload for output in self.of_kind("ledger")]
 
     @cached_property
-    def output_times(self) -> NDArray[np.int64]:
+    def headers(self) -> NDArray[Any]:
+        """Of the column stream's datagrams (``HEADER``)."""
+        heads = b"".join(output.payload[: HEADER.itemsize] for output in self.of_kind("columns"))
+        return np.frombuffer(heads, HEADER)
+
+    @cached_property
+    def columns(self) -> NDArray[Any]:
+        """All columns that left (``COLUMN``), in order."""
+        bodies = b"".join(output.payload[HEADER.itemsize :] for output in self.of_kind("columns"))
+        return np.frombuffer(bodies, COLUMN)
+
+    @cached_property
+    def column_datagram(self) -> NDArray[np.int64]:
+        """Of each column: its datagram."""
+        return np.repeat(np.arange(len(self.headers)), self.headers["columns"])
+
+    @cached_property
+    def output_ns(self) -> NDArray[np.int64]:
         """When datagrams of the column stream left."""
-        return np.array([output.time_ns for output in self.of_kind("column_stream")], dtype=np.int64)
+        return np.array([output.time_ns for output in self.of_kind("columns")], dtype=np.int64)
 
     @property
     def status(self) -> dict[str, Any]:
