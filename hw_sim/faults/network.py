@@ -115,6 +115,7 @@ class Reorder(PacketFault):
 class Jitter(PacketFault):
     """Datagrams wait in a queue that empties now and then: late by up to ``max_ms``, in order."""
 
+    lasting = True  # what waits at the end is not overtaken
     max_ms: float = 5.0
 
     def begin(self, beams: BeamTable, rng: np.random.Generator) -> Step:
@@ -123,7 +124,8 @@ class Jitter(PacketFault):
 
         def step(datagram: Datagram) -> Iterable[Datagram]:
             nonlocal last
-            last = max(last, datagram.time_ns + int(rng.random() * _ms(self.max_ms)))
+            wait = int(rng.random() * _ms(self.max_ms)) if self.active(datagram.time_ns) else 0
+            last = max(last, datagram.time_ns + wait)
             return (datagram._replace(time_ns=last),)
 
         return step

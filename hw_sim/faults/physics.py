@@ -63,7 +63,7 @@ class Crosstalk(PacketFault):
         return lambda datagram: (edit(datagram, change),)
 
 
-FOG_VISIBILITY_M = {"light": 200.0, "moderate": 80.0, "dense": 30.0}
+FOG_VISIBILITY_M = {"light": 200.0, "moderate": 60.0, "dense": 30.0}
 """Meteorological optical range of the three severities, metres: where 5 % of the contrast is left."""
 
 

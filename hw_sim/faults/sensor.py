@@ -186,14 +186,19 @@ class TimeJump(PacketFault):
 @dataclass(frozen=True, kw_only=True)
 class ClockDrift(PacketFault):
     """The sensor's clock runs ``ppm`` faster than the device's: without PPS a crystal is off by up to 100 ppm, and one
-    of the two is broken above that."""
+    of the two is broken above that. What it gained it keeps."""
 
+    lasting = True
     ppm: float = 1000.0
 
     def begin(self, beams: BeamTable, rng: np.random.Generator) -> Step:
         self.within("ppm", -1e5, 1e5)
-        start = round(self.from_s * 1e9)
-        return lambda datagram: (_shift_clock(datagram, round((datagram.time_ns - start) * self.ppm * 1e-9)),)
+
+        def step(datagram: Datagram) -> Iterable[Datagram]:
+            drifted_ns = min(datagram.time_ns, self.until_s * 1e9) - self.from_s * 1e9
+            return (_shift_clock(datagram, round(drifted_ns * self.ppm * 1e-9)),)
+
+        return step
 
 
 def _shift_clock(datagram: Datagram, shift_us: int) -> Datagram:

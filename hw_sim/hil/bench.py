@@ -18,16 +18,19 @@ from upbeam.hw_sim.can.uds import UdsTester, VirtualConnection
 from upbeam.hw_sim.faults import DeviceFault, apply_faults
 from upbeam.hw_sim.sensor import DATA_PORT, POSITION_PORT, Datagram, RecordedSensor, SimulatedSensor
 from upbeam.hw_sim.serial.framing import RecordParser, encode_record
-from upbeam.runtime.upsampler import load_model
 
 from .dut import KEY, Dut, NotPossibleError, Output
+from .models import model_crc, model_file
 from .record import Boot, Done, Record
 from .scenario import Action, Scenario
 
 __all__ = ["TICK_NS", "Bench", "run_scenario"]
 
+EXTENDED_SESSION = 3
 TICK_NS = 5_000_000
 """Between two ticks of the device."""
+BROKEN_BIT_ERRORS = 0.05
+"""Chance of a wrong bit on a broken CAN line: one frame of 130 bits in a thousand passes."""
 NOISE_NS = 10_000_000
 """Between two bursts of serial noise."""
 
@@ -63,7 +66,6 @@ class Bench:
         self._last_command: CanFrame | None = None
         self._drops: dict[str, int] = {}
         self._bus_was_off = False
-        self._shorted = False
         self._noise: dict[str, Any] | None = None
         self.device_node.listeners.append(self._device_hears)
         self.tester.listeners.append(self._tester_hears)
@@ -194,6 +196,7 @@ class Bench:
         if self.powered and off != self._bus_was_off:
             self.dut.bus_off(off)
             self._bus_was_off = off
+            self.device_node.flush()
             self.note("bus off" if off else "bus on")
 
     def note(self, what: str) -> None:
@@ -209,7 +212,7 @@ class Bench:
             self.power_off()
             self.at(self.now_ns + round(settings["off_ms"] * 1e6), self.power_on)
         elif what == "bus_off":
-            self._short(settings is not None)
+            self._break_bus(settings is not None)
         elif what == "wrong_crc":
             self.device_node.tamper = None if settings is None else _damaged_crc(settings["share"])
         elif what == "serial_noise":
@@ -219,17 +222,13 @@ class Bench:
         else:
             self.dut.disturb(what, settings)
 
-    def _short(self, on: bool) -> None:
-        """A short circuit: the bus is dominant, and the device's controller counts errors until it is bus-off."""
-        self._shorted = on
-        if on:
-            self._hold()
-
-    def _hold(self) -> None:
-        """Holds the bus a little longer, as long as the short lasts."""
-        if self._shorted:
-            self.bus.hold_dominant(max(self.now_ns, self.bus.now_ns), self.now_ns + NOISE_NS)
-            self.at(self.now_ns + NOISE_NS, self._hold)
+    def _break_bus(self, broken: bool) -> None:
+        """A bad line: hardly a frame passes, the device's controller counts its errors until it is bus-off. It stays
+        so until the line is good again: controllers wait for their driver."""
+        self.bus.set_bit_error_rate(BROKEN_BIT_ERRORS if broken else 0.0)
+        self.device_node.auto_recover = not broken
+        if not broken:
+            self.device_node.recover()
 
     def _make_noise(self, rng: np.random.Generator, settings: dict[str, Any]) -> None:
         if self._noise is not settings:
@@ -248,7 +247,7 @@ class Bench:
         settings = dict(action.settings)
         via = str(settings.pop("via", "can"))
         if action.action == "swap_model":
-            self.dut.swap_model(_model_file(str(settings["model"])), self.now_ns)
+            self.dut.swap_model(model_file(str(settings["model"])), self.now_ns)
             self.collect()
         elif action.action == "serial_bytes":
             self.dut.serial(bytes.fromhex(settings["hex"]), self.now_ns)
@@ -293,7 +292,7 @@ class Bench:
         if code is Command.MODE:
             argument = 255 if settings["mode"] == "AUTOMATIC" else int(Mode[settings["mode"]])
         elif code is Command.MODEL:
-            crc = _crc_of(str(settings["model"]))
+            crc = model_crc(str(settings["model"]))
         elif code is Command.CLEAR_FAULTS:
             argument = int(settings.get("fault", 0))
         if forged:
@@ -306,6 +305,7 @@ class Bench:
         """Talks to the device; the bench's clock goes on meanwhile."""
         with UdsTester(VirtualConnection(self.bus, self.tester, self.advance_next)) as tester:
             if action == "uds_clear_faults":
+                tester.session(EXTENDED_SESSION)
                 tester.clear()
                 result: list[str] = []
             else:
@@ -325,19 +325,6 @@ def _damaged_crc(share: float) -> Callable[[CanFrame], CanFrame]:
         return replace(frame, data=bytes([frame.data[0] ^ 0x55]) + frame.data[1:])
 
     return tamper
-
-
-def _model_file(name: str) -> bytes:
-    """A shipped model's file, or one of its bytes turned ("damaged NAME")."""
-    damaged = name.startswith("damaged ")
-    ubm = bytearray(load_model(name.removeprefix("damaged ")).data)
-    if damaged:
-        ubm[len(ubm) // 2] ^= 0x10
-    return bytes(ubm)
-
-
-def _crc_of(name: str) -> int:
-    return 0xDEADBEEF if name == "unknown" else int(load_model(name).info["crc32"])
 
 
 def run_scenario(scenario: Scenario, dut: Dut) -> Record:

@@ -11,7 +11,9 @@ import numpy as np
 from upbeam.hw_sim.can import CanFrame
 from upbeam.hw_sim.sensor import DATA_PORT, POSITION_PORT, Datagram
 from upbeam.runtime.daemon import HDL_32E, VLP_32C, Daemon, DaemonError
-from upbeam.runtime.upsampler import load_model, shipped_models
+from upbeam.runtime.upsampler import shipped_models
+
+from .models import model_file
 
 __all__ = ["DATA_SOURCE", "KEY", "Dut", "InProcessDut", "NotPossibleError", "Output"]
 
@@ -109,8 +111,8 @@ class InProcessDut:
         model = str(settings.pop("model", sensor))
         self._service_ns = settings.setdefault("service_ns", list(SERVICE_NS))
         self._daemon = Daemon(
-            load_model(model).data, {"sensor": SENSORS[sensor], **settings}, key=KEY, stored=self._stored,
-            models=[load_model(name).data for name in shipped_models()],
+            model_file(model), {"sensor": SENSORS[sensor], **settings}, key=KEY, stored=self._stored,
+            models=[model_file(f"another {model}"), *(model_file(name) for name in shipped_models())],
             sabotage=() if self.sabotage is None else (self.sabotage,),
         )  # fmt: skip
         self._daemon.tick(time_ns)

@@ -46,6 +46,7 @@ REACTIONS = {
     "answer": "a command is answered with the result `to`",
     "silence": "nothing leaves any more",
     "output": "columns leave again",
+    "diagnosis": "diagnostics read the confirmed fault codes `to`, separated by blanks",
     "tester_wrong_crc": "the receiver of the CAN messages refuses one for its checksum",
 }
 

@@ -16,7 +16,7 @@ from upbeam.model.beams import beam_table
 
 BEAMS = beam_table("vlp-32c")
 PACKET_KINDS = sorted(kind for kind, cls in FAULTS.items() if issubclass(cls, PacketFault))
-DELAYING = {"duplicate": 0.2, "reorder": 1.0, "jitter": 5.0, "flood": 0.4}
+DELAYING = {"duplicate": 0.2, "reorder": 1.0, "flood": 0.4}
 """Milliseconds by which a fault may reach beyond its end."""
 
 
