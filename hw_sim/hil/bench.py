@@ -29,8 +29,10 @@ __all__ = ["TICK_NS", "Bench", "run_scenario"]
 EXTENDED_SESSION = 3
 TICK_NS = 5_000_000
 """Between two ticks of the device."""
-BROKEN_BIT_ERRORS = 0.05
-"""Chance of a wrong bit on a broken CAN line: one frame of 130 bits in a thousand passes."""
+FLIPPED_BIT = 30
+"""A data bit of a short frame."""
+ATTEMPTS_TO_BUS_OFF = 32
+"""Failed attempts in a row: each adds 8 to the error counter, above 255 is bus-off."""
 NOISE_NS = 10_000_000
 """Between two bursts of serial noise."""
 
@@ -223,11 +225,12 @@ class Bench:
             self.dut.disturb(what, settings)
 
     def _break_bus(self, broken: bool) -> None:
-        """A bad line: hardly a frame passes, the device's controller counts its errors until it is bus-off. It stays
-        so until the line is good again: controllers wait for their driver."""
-        self.bus.set_bit_error_rate(BROKEN_BIT_ERRORS if broken else 0.0)
+        """Each of the next frames has a wrong bit, until the device's controller has counted itself bus-off. It stays
+        so until the fault ends: controllers wait for their driver."""
         self.device_node.auto_recover = not broken
-        if not broken:
+        if broken:
+            self.bus.flip_bit(FLIPPED_BIT, count=ATTEMPTS_TO_BUS_OFF)
+        else:
             self.device_node.recover()
 
     def _make_noise(self, rng: np.random.Generator, settings: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -91,8 +92,9 @@ def _accounting(record: Record) -> Iterator[Check]:
     for number, boot in enumerate(record.boots):
         s = boot.status
         dropped = sum(s["packets_dropped"].values())
-        story = f"boot {number}: {boot.delivered} sent, {s['packets_received']} received, {s['packets_processed']} processed, {dropped} dropped"
-        balanced = boot.delivered == s["packets_received"] == s["packets_processed"] + dropped
+        received, processed = s["packets_received"], s["packets_processed"]
+        story = f"boot {number}: {boot.delivered} sent, {received} received, {processed} processed, {dropped} dropped"
+        balanced = boot.delivered == received == processed + dropped
         yield _check("packets sent = processed + dropped", balanced, story)
         yield _check(
             "positions",
@@ -151,10 +153,10 @@ def _gaps(scenario: Scenario, record: Record) -> Iterator[Check]:
     edges = np.concatenate(([0], times, [round(scenario.seconds * 1e9)]))
     gaps = [
         (start, end)
-        for start, end in zip(edges[:-1], edges[1:], strict=True)
+        for start, end in itertools.pairwise(edges)
         if end - start > limit and not _allowed_silent(scenario, start, end, limit)
     ]
-    longest = max(((end - start) / NS_PER_MS, start / 1e9) for start, end in zip(edges[:-1], edges[1:], strict=True))
+    longest = max(((end - start) / NS_PER_MS, start / 1e9) for start, end in itertools.pairwise(edges))
     text = f"longest {longest[0]:.3f} ms at {longest[1]:.3f} s"
     yield _check(
         "output goes on", not gaps, f"{len(gaps)} gaps above {limit / NS_PER_MS:g} ms, {text}" if gaps else text
@@ -171,7 +173,7 @@ def _allowed_silent(scenario: Scenario, start_ns: int, end_ns: int, limit_ns: fl
 def _same_story(scenario: Scenario, record: Record) -> Iterator[Check]:
     """Ledger, CAN, serial line and counters agree, frame by frame."""
     lossless = not ({"bus_off", "reset"} & scenario.disturbances)
-    can = [frame for frame in record.of_kind("can")]
+    can = list(record.of_kind("can"))
     decoded = list(_decode((o.time_ns, o.payload) for o in can))
     yield from _ledger_story("CAN", record, decoded, lossless)
     yield from _ledger_story("serial", record, list(_decode(record.serial)), "reset" not in scenario.disturbances)
