@@ -91,8 +91,8 @@ def compare_columns(
     """Columns that left (``COLUMN``; ``turn_columns`` of the datagram of each) against what was delivered.
 
     Every column but an inserted one is a firing that was delivered, at its azimuth; its even rows are that firing's
-    and, for beams with an azimuth offset, its neighbours', to the bit; where a column says that samples are missing, a pixel
-    may be empty instead. Generated rows are empty without a return near by, in pass-through, and in row 63.
+    and, for beams with an azimuth offset, its neighbours', to the bit; where a column says that samples are missing, a
+    pixel may be empty instead. Generated rows are empty without a return near by, in pass-through, and in row 63.
     """
     plain = columns["flags"] & SECOND == 0
     columns, turn_columns = columns[plain], turn_columns[plain]

@@ -16,6 +16,7 @@ from . import (
     estimate,
     evaluate,
     export,
+    hil,
     inspect,
     ops,
     quantize,
@@ -49,6 +50,7 @@ app.command("inspect")(inspect.inspect)
 app.command("bench")(bench.bench)
 app.command("estimate")(estimate.estimate)
 app.command("doctor")(doctor.doctor)
+app.add_typer(hil.app, name="hil")
 
 
 def _print_version(value: bool) -> None:

@@ -1,0 +1,35 @@
+"""Hardware in the loop without the hardware: scenarios on a bench around a device (docs/hil.md)."""
+
+from .bench import Bench, run_scenario
+from .dut import Dut, InProcessDut, NotPossibleError, Output
+from .judge import Check, Timing, Verdict, judge
+from .record import Event, Record
+from .runner import Result, Sabotaged, in_process, run_all, run_one, sabotage_all, uncovered, write_junit
+from .scenario import Scenario, ScenarioError, load_scenario, load_scenarios
+
+__all__ = [
+    "Bench",
+    "Check",
+    "Dut",
+    "Event",
+    "InProcessDut",
+    "NotPossibleError",
+    "Output",
+    "Record",
+    "Result",
+    "Sabotaged",
+    "Scenario",
+    "ScenarioError",
+    "Timing",
+    "Verdict",
+    "in_process",
+    "judge",
+    "load_scenario",
+    "load_scenarios",
+    "run_all",
+    "run_one",
+    "run_scenario",
+    "sabotage_all",
+    "uncovered",
+    "write_junit",
+]
