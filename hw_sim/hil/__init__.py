@@ -3,8 +3,20 @@
 from .bench import Bench, run_scenario
 from .dut import Dut, InProcessDut, NotPossibleError, Output
 from .judge import Check, Timing, Verdict, judge
+from .network_dut import HardwareDut, ProcessDut
 from .record import Event, Record
-from .runner import Result, Sabotaged, in_process, run_all, run_one, sabotage_all, uncovered, write_junit
+from .runner import (
+    Result,
+    Sabotaged,
+    hardware,
+    in_process,
+    process,
+    run_all,
+    run_one,
+    sabotage_all,
+    uncovered,
+    write_junit,
+)
 from .scenario import Scenario, ScenarioError, load_scenario, load_scenarios
 
 __all__ = [
@@ -12,9 +24,11 @@ __all__ = [
     "Check",
     "Dut",
     "Event",
+    "HardwareDut",
     "InProcessDut",
     "NotPossibleError",
     "Output",
+    "ProcessDut",
     "Record",
     "Result",
     "Sabotaged",
@@ -22,10 +36,12 @@ __all__ = [
     "ScenarioError",
     "Timing",
     "Verdict",
+    "hardware",
     "in_process",
     "judge",
     "load_scenario",
     "load_scenarios",
+    "process",
     "run_all",
     "run_one",
     "run_scenario",

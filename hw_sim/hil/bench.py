@@ -21,18 +21,23 @@ from upbeam.hw_sim.serial.framing import RecordParser, encode_record
 
 from .dut import KEY, Dut, NotPossibleError, Output
 from .models import model_crc, model_file
+from .network_dut import NetworkDut
 from .record import Boot, Done, Record
 from .scenario import Action, Scenario
 
-__all__ = ["TICK_NS", "Bench", "run_scenario"]
+__all__ = ["TICK_NS", "Bench", "RealTimeBench", "run_scenario"]
 
 EXTENDED_SESSION = 3
+LINGER_NS = 20_000_000
+"""After the end, until the last frames are off the bus."""
 TICK_NS = 5_000_000
 """Between two ticks of the device."""
 FLIPPED_BIT = 30
 """A data bit of a short frame."""
 ATTEMPTS_TO_BUS_OFF = 32
 """Failed attempts in a row: each adds 8 to the error counter, above 255 is bus-off."""
+POLL_NS = 1_000_000
+"""On the real clock the device is looked at this often."""
 NOISE_NS = 10_000_000
 """Between two bursts of serial noise."""
 
@@ -166,10 +171,16 @@ class Bench:
         for output in self.dut.take():
             self.record.outputs.append(output)
             if output.kind == "can":
-                self.device_node.send(output.payload, max(output.time_ns, self.bus.now_ns))
+                self._send_on(output)
             elif output.kind == "serial":
                 for frame in self.parser.feed(output.payload):
                     self._take_record(frame, output)
+
+    def _send_on(self, output: Output) -> None:
+        self.device_node.send(output.payload, max(output.time_ns, self.bus.now_ns))
+
+    def _damage(self, settings: dict[str, Any] | None) -> None:
+        self.device_node.tamper = None if settings is None else _damaged_crc(settings["share"])
 
     def _take_record(self, frame: CanFrame, output: Output) -> None:
         self.record.serial.append((output.time_ns, frame))
@@ -216,7 +227,7 @@ class Bench:
         elif what == "bus_off":
             self._break_bus(settings is not None)
         elif what == "wrong_crc":
-            self.device_node.tamper = None if settings is None else _damaged_crc(settings["share"])
+            self._damage(settings)
         elif what == "serial_noise":
             self._noise = None if settings is None else settings
             if settings is not None:
@@ -316,6 +327,44 @@ class Bench:
         self.record.diagnostics.append((self.now_ns, action, result))
 
 
+class RealTimeBench(Bench):
+    """The same bench on the real clock, around a device on real wires.
+
+    What is planned for a moment is done when the monotonic clock says so, or as soon after as can be
+    (``lateness_ns``). CAN frames go over the device's own bus; the simulated one stays idle.
+    """
+
+    def __init__(self, dut: NetworkDut, stream: Iterator[Datagram], record: Record) -> None:
+        super().__init__(dut, stream, record)
+        self.network = dut
+        self.lateness_ns: list[int] = []
+        self._tamper: Callable[[CanFrame], CanFrame] | None = None
+
+    def _move(self, time_ns: int) -> None:
+        while (left := time_ns - self.network.now_ns()) > 0:
+            time.sleep(min(left, POLL_NS) * 1e-9)
+            self.collect()
+        self.now_ns = max(self.now_ns, time_ns)
+        self.bus.advance_to(self.now_ns)
+        self.lateness_ns.append(max(0, -left))
+
+    def _send_on(self, output: Output) -> None:
+        frame = self._tamper(output.payload) if self._tamper else output.payload
+        self._tester_hears(Received(output.time_ns, frame, self.device_node.name))
+
+    def _damage(self, settings: dict[str, Any] | None) -> None:
+        self._tamper = None if settings is None else _damaged_crc(settings["share"])
+
+    def send(self, frame: CanFrame, via: str = "can") -> None:
+        if via == "serial":
+            super().send(frame, via)
+        else:
+            self.dut.can(frame, self.now_ns)
+
+    def _diagnose(self, action: str) -> None:
+        raise NotPossibleError(f"{self.dut.name}: diagnostics on the real clock are python-can's and udsoncan's own")
+
+
 def _damaged_crc(share: float) -> Callable[[CanFrame], CanFrame]:
     debt = 0.0
 
@@ -331,30 +380,43 @@ def _damaged_crc(share: float) -> Callable[[CanFrame], CanFrame]:
 
 
 def run_scenario(scenario: Scenario, dut: Dut) -> Record:
-    """One scenario on one device, on virtual time."""
+    """One scenario on one device, on virtual time or on the real clock as the device has it."""
     begun = time.perf_counter()
     record = Record(scenario.name, dut.name, dut.virtual)
     missing = scenario.disturbances - dut.can_do
     if missing:
         record.not_possible = f"{dut.name} cannot do {', '.join(sorted(missing))}"
         return record
-    bench = Bench(dut, sensor_stream(scenario), record)
-    _plan(bench, scenario)
+    stream = sensor_stream(scenario)
+    if isinstance(dut, NetworkDut):
+        bench: Bench = RealTimeBench(dut, iter(list(stream)), record)  # made before, sent in time
+    else:
+        bench = Bench(dut, stream, record)
     try:
-        bench.power_on()
-        bench.tick()
-        bench.advance_to(round(scenario.seconds * 1e9))
+        _run(bench, scenario)
     except NotPossibleError as error:
         record.not_possible = str(error)
-        return record
+    finally:
+        if isinstance(dut, NetworkDut):
+            dut.close()
+    record.seconds = time.perf_counter() - begun
+    return record
+
+
+def _run(bench: Bench, scenario: Scenario) -> None:
+    record, dut = bench.record, bench.dut
+    _plan(bench, scenario)
+    bench.power_on()
+    bench.tick()
+    bench.advance_to(round(scenario.seconds * 1e9))
     dut.end(bench.now_ns)
     bench.collect()
-    bench.advance_to(bench.now_ns + 20_000_000)
+    bench.advance_to(bench.now_ns + LINGER_NS)
     record.boots[-1].status, record.boots[-1].end_ns = dut.status(), bench.now_ns
     record.serial_refused = bench.parser.refused
     record.bus_load = bench.bus.load(0, bench.now_ns)
-    record.seconds = time.perf_counter() - begun
-    return record
+    if isinstance(bench, RealTimeBench):
+        record.lateness_ns = bench.lateness_ns
 
 
 def sensor_stream(scenario: Scenario) -> Iterator[Datagram]:

@@ -161,7 +161,8 @@ def _compare_rows(
 
 def _numbers(columns: NDArray[Any], beams: BeamTable) -> NDArray[np.int64]:
     """Running numbers of columns by their times: what was lost leaves a gap, a clock that jumps a wide one."""
-    steps = np.diff(columns["time_ns"].astype(np.int64)) / (beams.firing_cycle_us * 1e3)
+    time_ns: NDArray[np.int64] = columns["time_ns"].astype(np.int64)
+    steps: NDArray[np.float64] = np.diff(time_ns) / (beams.firing_cycle_us * 1e3)
     steps = np.where((steps < 0.5) | (steps > _FAR), _FAR, np.floor(steps + 0.5))
     return np.concatenate(([0], np.cumsum(steps))).astype(np.int64)[: len(columns)]
 

@@ -91,6 +91,8 @@ class Record:
     bus_load: float = 0.0
     samples: list[tuple[int, dict[str, int]]] = field(default_factory=list)
     """Packets dropped by cause, at each tick at which they changed."""
+    lateness_ns: list[int] = field(default_factory=list)
+    """On the real clock: how late each thing was done."""
     seconds: float = 0.0
     """Wall time of the run."""
     not_possible: str = ""

@@ -12,13 +12,18 @@ from pathlib import Path
 from upbeam.runtime.daemon import check_names
 
 from .bench import run_scenario
-from .dut import Dut, InProcessDut
+from .dut import Dut, InProcessDut, NotPossibleError
 from .judge import Check, Verdict, judge
+from .network_dut import HardwareDut, ProcessDut
 from .record import Record
 from .scenario import Scenario
+from .toml import read_toml
 from .transcript import write_artefacts
 
-__all__ = ["Result", "Sabotaged", "in_process", "run_all", "run_one", "sabotage_all", "uncovered", "write_junit"]
+__all__ = [
+    "Result", "Sabotaged", "hardware", "in_process", "process", "run_all", "run_one", "sabotage_all", "uncovered",
+    "write_junit",
+]  # fmt: skip
 
 MakeDut = Callable[[Scenario, "str | None"], Dut]
 """A fresh device for a scenario, without the named detection or reaction."""
@@ -58,15 +63,41 @@ def in_process(scenario: Scenario, sabotage: str | None = None) -> Dut:
     return InProcessDut({"sensor": scenario.sensor.model, **scenario.dut}, sabotage)
 
 
+def process(scenario: Scenario, sabotage: str | None = None) -> Dut:
+    """``upbeamd`` over loopback, on the real clock."""
+    return ProcessDut({"sensor": scenario.sensor.model, **scenario.dut}, sabotage)
+
+
+def hardware(path: Path) -> MakeDut:
+    """The device that a TOML file describes. Errors: OSError, ValueError."""
+    told = read_toml(path)
+
+    def make(scenario: Scenario, sabotage: str | None = None) -> Dut:
+        if sabotage is not None:
+            raise NotPossibleError(f"{path.stem}: a real device cannot be sabotaged from here")
+        return HardwareDut(path, told)
+
+    return make
+
+
 def run_one(scenario: Scenario, make_dut: MakeDut = in_process, sabotage: str | None = None) -> Result:
     """Runs and judges. A crash of bench or device is a failed check, with its trace."""
     try:
-        record = run_scenario(scenario, make_dut(scenario, sabotage))
+        record = _run(scenario, make_dut, sabotage)
         verdict = Verdict(scenario.name) if record.not_possible else judge(scenario, record)
     except Exception:
         record = Record(scenario.name, "?", True)
         verdict = Verdict(scenario.name, [Check("runs to its end", False, traceback.format_exc())])
     return Result(scenario, record, verdict)
+
+
+def _run(scenario: Scenario, make_dut: MakeDut, sabotage: str | None) -> Record:
+    try:
+        return run_scenario(scenario, make_dut(scenario, sabotage))
+    except NotPossibleError as error:
+        record = Record(scenario.name, "none", True)
+        record.not_possible = str(error)
+        return record
 
 
 def run_all(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -11,10 +10,7 @@ from typing import Any
 from upbeam.hw_sim.faults import DeviceFault, Fault, make_fault
 from upbeam.hw_sim.sensor import SensorConfig
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from .toml import read_toml
 
 __all__ = [
     "ACTIONS", "REACTIONS", "Action", "Expectation", "ExpectedFault", "ExpectedReaction", "Scenario", "ScenarioError",
@@ -44,6 +40,7 @@ REACTIONS = {
     "swap": "another model file is in use",
     "reject": "a model file is refused",
     "answer": "a command is answered with the result `to`",
+    "flushed": "all columns of what was received before have left",
     "silence": "nothing leaves any more",
     "output": "columns leave again",
     "diagnosis": "diagnostics read the confirmed fault codes `to`, separated by blanks",
@@ -157,9 +154,11 @@ def load_scenarios(folder: Path, names: Iterable[str] = ()) -> list[Scenario]:
 def load_scenario(path: Path) -> Scenario:
     """One scenario. Errors: ScenarioError."""
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError) as error:
-        raise ScenarioError(f"{path}: {error}") from None
+        raw = read_toml(path)
+    except OSError as error:
+        raise ScenarioError(f"{path}: {error.strerror}") from None
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
     try:
         return parse_scenario(path.stem, raw)
     except (ValueError, TypeError, KeyError) as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,9 +40,7 @@ def encode_position(toh_us: int) -> bytes:
     return Position(time_us=toh_us, pps=_PPS_LOCKED).encode()
 
 
-def change_position(
-    payload: bytes, change: Callable[[Position], dict[Literal["time_us", "pps", "thermal_shutdown"], int]]
-) -> bytes:
+def change_position(payload: bytes, change: Callable[[Position], dict[str, Any]]) -> bytes:
     """The position packet with fields changed; ``change`` gives the new ones."""
     position = Position.decode(payload)
     return replace(position, **change(position)).encode()

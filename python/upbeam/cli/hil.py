@@ -91,10 +91,14 @@ def _load(folder: Path, names: list[str] | None) -> list[Scenario]:
 
 def _device(dut: str) -> tuple[MakeDut, bool]:
     """How to make a device, and whether it lives on virtual time."""
-    from upbeam.hw_sim.hil import in_process
+    from upbeam.hw_sim.hil import hardware, in_process, process
 
     if dut == "inprocess":
         return in_process, True
+    if dut == "process":
+        return process, False
+    if dut.endswith(".toml"):
+        return hardware(Path(dut)), False
     raise UserError(f"--dut {dut}: expected inprocess, process or a .toml file")
 
 
