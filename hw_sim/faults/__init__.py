@@ -2,10 +2,13 @@
 
 from . import device, network, physics, sensor
 from .base import FAULTS, DeviceFault, Fault, Moment, PacketFault, apply_faults, make_fault
+from .catalogue import CATALOGUE, Entry
 
 __all__ = [
+    "CATALOGUE",
     "FAULTS",
     "DeviceFault",
+    "Entry",
     "Fault",
     "Moment",
     "PacketFault",

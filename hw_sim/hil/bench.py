@@ -283,6 +283,10 @@ class Bench:
         else:
             self.tester.send(frame, max(self.now_ns, self.bus.now_ns))
 
+    def command(self, settings: dict[str, Any], via: str = "can") -> None:
+        """The tester sends an authentic command."""
+        self.send(self._command_frame("command", settings), via)
+
     def _command_frame(self, action: str, settings: dict[str, Any]) -> CanFrame:
         if action == "replayed_command":
             if self._last_command is None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from upbeam.hw_sim.faults.toml import read_toml
 from upbeam.runtime.daemon import check_names
 
 from .bench import run_scenario
@@ -17,7 +18,6 @@ from .judge import Check, Verdict, judge
 from .network_dut import HardwareDut, ProcessDut
 from .record import Record
 from .scenario import Scenario
-from .toml import read_toml
 from .transcript import write_artefacts
 
 __all__ = [

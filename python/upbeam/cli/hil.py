@@ -35,6 +35,31 @@ def list_scenarios(folder: FolderOption = DEFAULT_FOLDER, as_json: JsonOption = 
     show(table(f"{len(rows)} scenarios in {folder}", ["scenario", "title", "length", "covers"], rows))
 
 
+@app.command("faults")
+def list_faults(
+    markdown: Annotated[bool, typer.Option("--markdown", help="As docs/faults.md.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """The catalogue of faults: what each must lead to, and within what time."""
+    from upbeam.hw_sim.faults import CATALOGUE, FAULTS
+    from upbeam.hw_sim.faults.catalogue import markdown as write
+
+    if markdown:
+        typer.echo(write(), nl=False)
+    elif as_json:
+        emit_json({"faults": {kind: {"group": FAULTS[kind].group, **vars(e)} for kind, e in CATALOGUE.items()}})
+    else:
+        rows = [
+            [kind, FAULTS[kind].group, entry.detects or "none", _limit(entry.within_ms), _limit(entry.healthy_ms)]
+            for kind, entry in CATALOGUE.items()
+        ]
+        show(table(f"{len(rows)} faults", ["fault", "of", "code", "within ms", "healthy ms"], rows))
+
+
+def _limit(value: float | None) -> str:
+    return "" if value is None else f"{value:g}"
+
+
 @app.command("run")
 def run(
     names: NameOption = None,
