@@ -388,16 +388,10 @@ def run_scenario(scenario: Scenario, dut: Dut) -> Record:
     begun = time.perf_counter()
     record = Record(scenario.name, dut.name, dut.virtual)
     missing = scenario.disturbances - dut.can_do
-    if missing:
-        record.not_possible = f"{dut.name} cannot do {', '.join(sorted(missing))}"
-        return record
-    stream = sensor_stream(scenario)
-    if isinstance(dut, NetworkDut):
-        bench: Bench = RealTimeBench(dut, iter(list(stream)), record)  # made before, sent in time
-    else:
-        bench = Bench(dut, stream, record)
     try:
-        _run(bench, scenario)
+        if missing:
+            raise NotPossibleError(f"{dut.name} cannot do {', '.join(sorted(missing))}")
+        _run(_bench(scenario, dut, record), scenario)
     except NotPossibleError as error:
         record.not_possible = str(error)
     finally:
@@ -405,6 +399,13 @@ def run_scenario(scenario: Scenario, dut: Dut) -> Record:
             dut.close()
     record.seconds = time.perf_counter() - begun
     return record
+
+
+def _bench(scenario: Scenario, dut: Dut, record: Record) -> Bench:
+    stream = sensor_stream(scenario)
+    if isinstance(dut, NetworkDut):
+        return RealTimeBench(dut, iter(list(stream)), record)  # made before, to be sent in time
+    return Bench(dut, stream, record)
 
 
 def _run(bench: Bench, scenario: Scenario) -> None:
@@ -421,6 +422,7 @@ def _run(bench: Bench, scenario: Scenario) -> None:
     record.bus_load = bench.bus.load(0, bench.now_ns)
     if isinstance(bench, RealTimeBench):
         record.lateness_ns = bench.lateness_ns
+        record.has_serial = bench.network.serial_port is not None
 
 
 def sensor_stream(scenario: Scenario) -> Iterator[Datagram]:

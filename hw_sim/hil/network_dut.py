@@ -31,6 +31,7 @@ __all__ = ["HardwareDut", "NetworkDut", "ProcessDut", "SerialPort"]
 _READY_S = 20.0
 _END_S = 20.0
 _BUFFER_BYTES = 8 << 20
+_ON_ITS_WAY_S = 0.01
 _SETTLE_S = 0.05
 """After the device's end, for datagrams that are still on their way."""
 
@@ -208,12 +209,12 @@ class ProcessDut(NetworkDut):
     """``upbeamd`` as a process of its own, over loopback, a pty, and CAN frames in UDP datagrams."""
 
     def __init__(self, settings: Mapping[str, Any], sabotage: str | None = None, executable: Path = UPBEAMD) -> None:
-        super().__init__("process", frozenset({"serial_noise", "reset", "wrong_crc"}))
         if not executable.is_file():
             raise NotPossibleError(f"{executable}: not built (upbeamd needs Linux)")
         impossible = _VIRTUAL_ONLY & set(settings)
         if impossible:
             raise NotPossibleError(f"process: {', '.join(sorted(impossible))} are of virtual time")
+        super().__init__("process", frozenset({"serial_noise", "reset", "wrong_crc"}))
         self._executable = executable
         self._settings = dict(settings)
         self._sabotage = sabotage
@@ -222,6 +223,7 @@ class ProcessDut(NetworkDut):
         self._pty = PtyPair()
         self.serial_port = self._pty
         self._process: subprocess.Popen[str] | None = None
+        self._messenger: threading.Thread | None = None
         self._can_port = _free_port()
         self._seen_ns = 0
         self._status: dict[str, Any] = _EMPTY_STATUS
@@ -272,7 +274,8 @@ class ProcessDut(NetworkDut):
             line = process.stderr.readline()
             self.messages.append(line.rstrip())
             if "ready" in line:
-                threading.Thread(target=self._read_messages, args=(process,), daemon=True).start()
+                self._messenger = threading.Thread(target=self._read_messages, args=(process,), daemon=True)
+                self._messenger.start()
                 return
             if not line and process.poll() is not None:
                 break
@@ -280,16 +283,24 @@ class ProcessDut(NetworkDut):
 
     def _read_messages(self, process: subprocess.Popen[str]) -> None:
         assert process.stderr is not None
-        self.messages += [line.rstrip() for line in process.stderr]
+        with process.stderr as lines:
+            self.messages += [line.rstrip() for line in lines]
 
     def power_off(self, time_ns: int) -> dict[str, Any]:
         """A kill: what it had not written is lost, and its counters with it."""
-        process = self._running()
-        process.kill()
-        process.wait()
-        self._process = None
-        self._take_ledger()
+        self._running().kill()
+        self._wait()
         return self.status()
+
+    def _wait(self) -> None:
+        """Until the process has ended and its last words are read."""
+        process = self._running()
+        process.wait(_END_S)
+        self._process = None
+        if self._messenger is not None:
+            self._messenger.join()
+            self._messenger = None
+        self._take_ledger()
 
     def _running(self) -> subprocess.Popen[str]:
         if self._process is None:
@@ -314,17 +325,14 @@ class ProcessDut(NetworkDut):
         return self._status
 
     def end(self, time_ns: int) -> None:
-        process = self._running()
-        process.send_signal(signal.SIGTERM)
-        process.wait(_END_S)
+        self._running().send_signal(signal.SIGTERM)
+        self._wait()
         time.sleep(_SETTLE_S)
-        self._take_ledger()
-        self._process = None
 
     def close(self) -> None:
         if self._process is not None:
             self._process.kill()
-            self._process.wait()
+            self._wait()
         super().close()
         self._pty.close()
         self._scratch.cleanup()
@@ -441,8 +449,9 @@ class HardwareDut(NetworkDut):
         return {**self._counters, "faults": sorted(self._faults)}
 
     def end(self, time_ns: int) -> None:
-        """It runs on; what is on its way arrives."""
-        time.sleep(_SETTLE_S)
+        """It runs on, without a sensor: what it says of that is no longer listened to."""
+        time.sleep(_ON_ITS_WAY_S)
+        self._stop.set()
 
 
 def _event(kind: str, time_ns: int, *, a: int = 0, b: int = 0, fault: str = "") -> dict[str, Any]:

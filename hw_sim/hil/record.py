@@ -88,6 +88,8 @@ class Record:
     """To commands: time, channel, answer."""
     diagnostics: list[tuple[int, str, Any]] = field(default_factory=list)
     """What diagnostics gave: time, action, result."""
+    has_serial: bool = True
+    """Whether the tester had a serial line to the device."""
     bus_load: float = 0.0
     samples: list[tuple[int, dict[str, int]]] = field(default_factory=list)
     """Packets dropped by cause, at each tick at which they changed."""

@@ -93,7 +93,7 @@ def run_one(scenario: Scenario, make_dut: MakeDut = in_process, sabotage: str | 
 
 def _run(scenario: Scenario, make_dut: MakeDut, sabotage: str | None) -> Record:
     try:
-        return run_scenario(scenario, make_dut(scenario, sabotage))
+        return run_scenario(scenario, make_dut(scenario, sabotage))  # which closes the device
     except NotPossibleError as error:
         record = Record(scenario.name, "none", True)
         record.not_possible = str(error)
