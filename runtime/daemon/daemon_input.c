@@ -175,10 +175,14 @@ static int in_flood(const upb_daemon *d, uint64_t received_ns) {
            daemon_reacts(d, REACT_FLOOD);
 }
 
+static int is_stuck(const upb_daemon *d) {
+    return d->stuck_run >= STUCK_RUN && daemon_detects(d, UPB_FAULT_SENSOR_AZIMUTH_STUCK) &&
+           daemon_reacts(d, REACT_STUCK);
+}
+
 static int is_stuck_there(const upb_daemon *d, const upb_packet_info *info) {
     const uint32_t a = d->stuck_azimuth_mdeg, b = info->azimuth_mdeg, apart = a > b ? a - b : b - a;
-    return d->stuck_run >= STUCK_RUN && (apart < 100 || apart > UPB_FULL_TURN_MDEG - 100) &&
-           daemon_detects(d, UPB_FAULT_SENSOR_AZIMUTH_STUCK) && daemon_reacts(d, REACT_STUCK);
+    return is_stuck(d) && (apart < 100 || apart > UPB_FULL_TURN_MDEG - 100);
 }
 
 static uint32_t drop_of(upb_packet_status status) {
@@ -198,6 +202,14 @@ static uint32_t drop_of(upb_packet_status status) {
     }
 }
 
+/* During a flood: does the packet continue the sequence, or one that came back? The sensor may have been away. */
+static int is_the_sensors(upb_daemon *d, upb_packet_status status, const upb_packet_info *info) {
+    if (status != UPB_PACKET_OK || info->kind != UPB_PACKET_KIND_DATA || (uint32_t)info->sensor != d->config.sensor)
+        return 0;
+    return !d->sequence.started || continues(d, d->sequence.time_us, info->time_us) ||
+           is_confirmed(d, info, CONFIRM_LATE);
+}
+
 /* UPB_DROPS: take it. */
 static uint32_t judge(upb_daemon *d, const uint8_t *data, size_t bytes, uint32_t source_ipv4, uint64_t received_ns,
                       upb_packet_info *info) {
@@ -206,8 +218,7 @@ static uint32_t judge(upb_daemon *d, const uint8_t *data, size_t bytes, uint32_t
     if (d->config.source_ipv4 && source_ipv4 != d->config.source_ipv4 && daemon_reacts(d, REACT_SOURCE))
         return UPB_DROP_WRONG_SOURCE;
     const upb_packet_status status = upb_packet_identify(data, bytes, info);
-    if (in_flood(d, received_ns) &&
-        (status != UPB_PACKET_OK || (d->sequence.started && !continues(d, d->sequence.time_us, info->time_us))))
+    if (in_flood(d, received_ns) && !is_the_sensors(d, status, info))
         return UPB_DROP_FLOOD;
     if (status != UPB_PACKET_OK)
         return drop_of(status);
@@ -287,6 +298,8 @@ void upb_daemon_packet(upb_daemon *d, const uint8_t *data, size_t bytes, uint32_
         refuse(d, drop, received_ns);
         return;
     }
+    if (is_stuck(d)) /* it moves again, at a speed that standing still says nothing of */
+        daemon_forget_turn(d);
     take_into_sequence(d, &info, received_ns);
     d->sensor_silent = 0;
     const uint32_t mode_before = d->ladder.mode;

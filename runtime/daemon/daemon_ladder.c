@@ -22,6 +22,7 @@ void daemon_ladder_apply(upb_daemon *d) {
         l->mode = mode;
         l->least_service_ns = UINT64_MAX;
         d->counters.mode_changes++;
+        d->health.now.service_ns = d->health.now.service_packets = 0; /* a mean over two modes says nothing */
         daemon_event(d, UPB_EVENT_MODE, before, mode, d->lag_ns);
     }
     if (d->stream)
