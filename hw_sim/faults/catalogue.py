@@ -92,7 +92,7 @@ CATALOGUE: dict[str, Entry] = {
         "generated. The kept file can only come from outside: that stays reported.", 1000,
     ),
     "slow_down": Entry(
-        "COMPUTE_OVERLOAD", 300, "The degradation ladder: valid means, repeated rows, measured rows only; packets that "
+        "COMPUTE_OVERLOAD", 400, "The degradation ladder: valid means, repeated rows, measured rows only; packets that "
         "waited longer than 40 ms are dropped as stale.", 3000, ("COMPUTE_THROTTLE", "COMPUTE_DEADLINE", "NET_LOSS"),
     ),
     "throttle": Entry("COMPUTE_THROTTLE", 700, "Goes on; reported before anything is late.", 870),

@@ -375,12 +375,12 @@ class HardwareDut(NetworkDut):
     and counters are those it tells there."""
 
     def __init__(self, path: Path, told: Mapping[str, Any]) -> None:
-        power = told.get("power")
-        super().__init__(path.stem, frozenset({"serial_noise", "wrong_crc"} | ({"reset"} if power else set())))
         unknown = set(told) - {"sensor", "columns_port", "can", "serial", "baudrate", "power"}
         if unknown or "sensor" not in told:
             what = f"unknown key {', '.join(sorted(unknown))}" if unknown else "missing key sensor"
             raise ValueError(f"{path}: {what}; known: sensor, columns_port, can, serial, baudrate, power")
+        power = told.get("power")
+        super().__init__(path.stem, frozenset({"serial_noise", "wrong_crc"} | ({"reset"} if power else set())))
         address = dict(told["sensor"])
         self.data_address = (str(address["address"]), int(address.get("data_port", DATA_PORT)))
         self.position_address = (self.data_address[0], int(address.get("position_port", POSITION_PORT)))

@@ -151,31 +151,26 @@ def _tell(result: Result) -> None:
         message(f"    see {result.artefacts}")
 
 
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
-
-
 def _print(results: list[Result], caught: list[Sabotaged], dut: str, sabotage: bool) -> None:
-    rows: list[list[str]] = []
+    """Lines of fixed columns: a table would cut names short where the terminal is narrow."""
+    clock = "virtual time" if dut == "inprocess" else "real time, measured"
+    typer.echo(f"{dut}, {clock}; milliseconds from the cause's begin, and from its end until healed")
+    typer.echo(_line("scenario", "", "what", "after", "limit", "on CAN", "healed"))
     for result in results:
-        head = [result.scenario.name, result.outcome]
-        timings = result.verdict.timings
-        if not timings:
-            rows.append([*head, "", "", "", "", ""])
-        for timing in timings:
-            figures = [
-                _number(timing.ms),
-                f"{timing.limit_ms:g}",
-                _number(timing.reported_ms),
-                _number(timing.healed_ms),
-            ]
-            rows.append([*head, timing.what, *figures])
-            head = ["", ""]
-    clock = "virtual time" if dut == "inprocess" else "real time"
-    columns = ["scenario", "", "what", "after ms", "limit ms", "on CAN after ms", "healed after ms"]
-    show(table(f"{dut}: {_count(results, 'passed')} of {len(results)} scenarios passed ({clock})", columns, rows))
+        name, outcome = result.scenario.name, result.outcome
+        if not result.verdict.timings:
+            typer.echo(_line(name, outcome))
+        for timing in result.verdict.timings:
+            figures = (timing.ms, timing.limit_ms, timing.reported_ms, timing.healed_ms)
+            typer.echo(_line(name, outcome, timing.what, *("" if v is None else f"{v:.2f}" for v in figures)))
+            name = outcome = ""
+    typer.echo(f"{_count(results, 'passed')} of {len(results)} scenarios passed")
     if sabotage:
-        show(f"sabotage: {sum(one.caught for one in caught)} of {len(caught)} noticed")
+        typer.echo(f"sabotage: {sum(one.caught for one in caught)} of {len(caught)} noticed")
+
+
+def _line(name: str, outcome: str, what: str = "", *figures: str) -> str:
+    return f"{name:<28} {outcome:<8} {what:<24}{''.join(f'{figure:>10}' for figure in figures)}".rstrip()
 
 
 def _count(results: list[Result], outcome: str) -> int:
