@@ -6,7 +6,8 @@ import heapq
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from upbeam.hw_sim.can.commander import Command, Commander, Mode
 from upbeam.hw_sim.can.database import Decoder
 from upbeam.hw_sim.can.uds import UdsTester, VirtualConnection
 from upbeam.hw_sim.faults import DeviceFault, apply_faults
-from upbeam.hw_sim.sensor import DATA_PORT, POSITION_PORT, Datagram, RecordedSensor, SimulatedSensor
+from upbeam.hw_sim.sensor import DATA_PORT, POSITION_PORT, Datagram, RecordedSensor, SensorConfig, SimulatedSensor
 from upbeam.hw_sim.serial.framing import RecordParser, encode_record
 
 from .dut import KEY, Dut, NotPossibleError, Output
@@ -425,11 +426,32 @@ def _run(bench: Bench, scenario: Scenario) -> None:
         record.has_serial = bench.network.serial_port is not None
 
 
+class _Replayed:
+    """A simulated sensor whose datagrams are made once: scenarios share few sensors."""
+
+    def __init__(self, sensor: SimulatedSensor) -> None:
+        self._made: list[Datagram] = []
+        self._rest = iter(sensor)
+
+    def until(self, time_ns: int) -> Iterator[Datagram]:
+        for k in count():
+            if k == len(self._made):
+                self._made.append(next(self._rest))
+            if self._made[k].time_ns >= time_ns:
+                return
+            yield self._made[k]
+
+
+@lru_cache(maxsize=4)
+def _room(config: SensorConfig) -> _Replayed:
+    return _Replayed(SimulatedSensor(config))
+
+
 def sensor_stream(scenario: Scenario) -> Iterator[Datagram]:
     """What the network delivers: the sensor's datagrams with the scenario's faults."""
     end_ns = round(scenario.seconds * 1e9)
     if scenario.source == "room":
-        sensor: SimulatedSensor | RecordedSensor = SimulatedSensor(scenario.sensor)
+        sensor: _Replayed | RecordedSensor = _room(scenario.sensor)
     elif scenario.source.startswith("recording:"):
         sensor = RecordedSensor.open(scenario.source.removeprefix("recording:"))
     else:

@@ -184,6 +184,17 @@ def _described(scenario: Scenario) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _lateness(result: Result) -> dict[str, float] | None:
+    """On the real clock: how late the bench itself was, measured."""
+    late = sorted(result.record.lateness_ns)
+    if not late:
+        return None
+    return {
+        name: late[min(len(late) - 1, int(len(late) * share))] / 1e3
+        for name, share in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))
+    }
+
+
 def _summary(results: list[Result], caught: list[Sabotaged], dut: str, sabotage: bool) -> dict[str, Any]:
     summary: dict[str, Any] = {
         "dut": dut,
@@ -208,5 +219,6 @@ def _result(result: Result) -> dict[str, Any]:
         "checks": [vars(check) for check in result.verdict.checks],
         "timings": [vars(timing) for timing in result.verdict.timings],
         "seconds": round(result.record.seconds, 3),
+        "bench_lateness_us": _lateness(result),
         "artefacts": str(result.artefacts) if result.artefacts else None,
     }
