@@ -16,7 +16,7 @@ from upbeam.hw_sim.sensor import Datagram
 from upbeam.hw_sim.sensor.datagram import DATA_BYTES, DATA_PORT, PACKET
 from upbeam.model.beams import BeamTable
 
-__all__ = ["Firings", "compare_columns", "delivered_firings"]
+__all__ = ["Firings", "compare_columns", "compare_hdl64", "delivered_firings"]
 
 INCOMPLETE, LAST, SECOND, INSERTED = 1, 2, 4, 8
 """Flags of a column (docs/column-stream.md); its mode stands in bits 8 and 9."""
@@ -24,7 +24,10 @@ PASS_THROUGH = 3
 _FAR = 4096
 """Columns apart that have nothing to do with each other: more than any beam's offset."""
 _HOUR_NS = 3_600_000_000_000
-_FLAG = 0xEEFF
+_FLAG, _LOWER = 0xEEFF, 0xDDFF
+_HDL64_UNIT_UM = 2000
+_HDL64_FIRINGS = 6
+"""Of a packet."""
 _DUAL = 0x39
 
 
@@ -194,4 +197,35 @@ def _check_generated(columns: NDArray[Any]) -> list[str]:
     lone = (odd[:, :31] > 0) & ~(near[:, :-1] | near[:, 1:])
     if lone.any():
         faults.append(f"{int(lone.sum())} generated returns with none measured near by")
+    return faults
+
+
+def compare_hdl64(payloads: Sequence[bytes], columns: NDArray[Any], unit_um: int) -> list[str]:
+    """HDL-64E packets against the columns that left, in order: what is wrong, one sentence each.
+
+    Row 2k is laser k of the upper bank, row 2k+1 laser k of the lower; counts are of 2 mm, beyond 16 bits no return;
+    row 63 is empty. Packets may end with firings that no column fills any more.
+    """
+    packets = np.frombuffer(b"".join(payloads), dtype=PACKET)["blocks"]
+    upper, lower = packets[:, 0::2], packets[:, 1::2]
+    faults = []
+    if np.any(upper["flag"] != _FLAG) or np.any(lower["flag"] != _LOWER):
+        faults.append("a block's flag is not its bank's")
+    plain = columns[columns["flags"] & SECOND == 0]
+    count = min(len(plain), upper.size)
+    counts = plain["distance"][:count].astype(np.int64) * unit_um // _HDL64_UNIT_UM
+    counts[counts > 65535] = 0
+    counts[:, 63] = 0
+    for name, bank, rows in (("upper", upper, counts[:, 0::2]), ("lower", lower, counts[:, 1::2])):
+        shown = bank["returns"]["distance"].reshape(-1, 32)
+        wrong = np.count_nonzero(shown[:count] != rows)
+        if wrong:
+            faults.append(f"{wrong} returns of the {name} bank are not the columns'")
+        if shown[count:].any():
+            faults.append(f"returns of the {name} bank after the last column")
+    azimuth = np.floor((plain["azimuth_mdeg"][:count] + 5) / 10).astype(np.int64) % 36000
+    if np.any(upper["azimuth"].reshape(-1)[:count] != azimuth):
+        faults.append("azimuths are not the columns'")
+    if not 0 <= upper.size - len(plain) < _HDL64_FIRINGS:
+        faults.append(f"{upper.size} firings in packets, {len(plain)} columns")
     return faults

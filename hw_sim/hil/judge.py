@@ -13,7 +13,7 @@ from upbeam.hw_sim.can.database import LEDGER_ID, Decoded, Decoder
 from upbeam.hw_sim.can.e2e import E2EStatus
 from upbeam.hw_sim.sensor import blocks, is_data
 
-from .firings import INSERTED, SECOND, compare_columns, delivered_firings
+from .firings import INSERTED, SECOND, compare_columns, compare_hdl64, delivered_firings
 from .record import Boot, Event, Record
 from .scenario import MODES, ExpectedFault, ExpectedReaction, Scenario
 
@@ -153,6 +153,7 @@ def _output(scenario: Scenario, record: Record) -> Iterator[Check]:
     yield _check(
         "datagrams in sequence", len(first) <= len(record.boots) - 1, f"{len(headers)} datagrams, {len(first)} breaks"
     )
+    yield from _shown(record)
     yield from _gaps(scenario, record)
     missed = sum(r["verdict"] == "missed" for r in record.ledger)
     yield _timed(
@@ -164,6 +165,15 @@ def _output(scenario: Scenario, record: Record) -> Iterator[Check]:
     worst = max((MODES.index(str(r["mode"]).upper()) for r in record.ledger), default=0)
     limit = MODES.index(scenario.expect.worst_mode)
     yield _timed(record, "worst mode", worst <= limit, f"{MODES[worst]}, {MODES[limit]} allowed")
+
+
+def _shown(record: Record) -> Iterator[Check]:
+    """What HDL-64E drivers see. Where the stream began anew packets are filled up, and columns have no fixed place."""
+    shown = [output.payload for output in record.of_kind("hdl64")]
+    if not shown or len(record.boots) > 1 or record.status["streams_made"] > 1:
+        return
+    wrong = compare_hdl64(shown, record.columns, int(record.headers["unit_um"][0]))
+    yield _check("HDL-64E packets = columns", not wrong, "; ".join(wrong) or f"{len(shown)} packets")
 
 
 def _gaps(scenario: Scenario, record: Record) -> Iterator[Check]:
@@ -198,6 +208,10 @@ def _same_story(scenario: Scenario, record: Record) -> Iterator[Check]:
     yield from _ledger_story("CAN", record, decoded, lossless)
     if record.has_serial:
         yield from _ledger_story("serial", record, list(_decode(record.serial)), "reset" not in scenario.disturbances)
+    if "ledger" in record.status:
+        told = record.status["ledger"]
+        same = told == record.ledger[-len(told) :] if told else not record.ledger
+        yield _check("ledger in JSON = ledger", same, f"{len(told)} records")
     if record.virtual:  # frames carry no time of sending: only here it is known to the nanosecond
         yield from _mode_story(record, decoded)
         yield from _fault_story(record, decoded)

@@ -157,6 +157,13 @@ def test_the_judge_finds_one_wrong_byte(good: Result, at: int, what: str) -> Non
     assert any(name.startswith(what) for name in with_outputs(good, change))
 
 
+def test_the_judge_looks_at_what_drivers_see(good: Result) -> None:
+    shown = [output for output in good.record.outputs if output.kind == "hdl64"]
+    chosen = id(shown[50])
+    names = with_outputs(good, lambda o: [patched(o, 4, bytes([o.payload[4] ^ 1])) if id(o) == chosen else o])
+    assert names == ["HDL-64E packets = columns"]
+
+
 def test_the_judge_misses_what_is_missing(good: Result) -> None:
     columns = [output for output in good.record.outputs if output.kind == "columns"]
     lost = set(map(id, columns[100:120]))
