@@ -19,7 +19,8 @@ enum {
     NEAR_UM = 4000000,
     FAR_UM = 25000000,
     ALONE_UM = 1000000, /* a return this much off both its neighbours in the row stands alone */
-    STUCK_FIRINGS = 6
+    STUCK_FIRINGS = 6,
+    SERVICE_PACKETS = 16 /* a mean of fewer would be a baseline that nothing reaches again */
 };
 
 /* Sixteenths keep a baseline of whole permille moving. */
@@ -119,7 +120,7 @@ static void look_at_work(upb_daemon *d) {
     health *h = &d->health;
     const uint32_t mode = d->ladder.mode;
     look(d, UPB_FAULT_COMPUTE_OVERLOAD, h->now.overloaded > 0, d->lag_ns);
-    if (!h->now.service_packets)
+    if (h->now.service_packets < SERVICE_PACKETS)
         return;
     const uint64_t mean = h->now.service_ns / h->now.service_packets;
     h->service_mean_ns = mean;

@@ -6,7 +6,7 @@
 enum {
     LATE_US = 100000,    /* behind by at most this: overtaken on the way; by more: the clock was set back */
     AHEAD_NS = 50000000, /* before it can have been sent: the clock was set forward */
-    CONFIRM_LATE = 4,    /* packets in order, all late: the clock was set back a little */
+    CONFIRM_LATE = 4,    /* packets in order, all late: the clock was set back a little; or the sensor in a flood */
     CONFIRM_JUMP = 2,
     CONTINUES_PACKETS = 4, /* a packet this near behind another follows it */
     STUCK_RUN = 24,        /* firings, two packets */
@@ -49,6 +49,8 @@ static int was_taken(const packet_sequence *s, const upb_packet_info *info) {
 /* A packet outside the sequence: true if enough others before it tell the same story. */
 static int is_confirmed(upb_daemon *d, const upb_packet_info *info, uint32_t needed) {
     packet_sequence *s = &d->sequence;
+    if (s->candidate_count && s->candidate_us == info->time_us)
+        return 0; /* the same one again */
     s->candidate_count =
         s->candidate_count && continues(d, s->candidate_us, info->time_us) ? s->candidate_count + 1 : 1;
     s->candidate_us = info->time_us;
@@ -75,7 +77,12 @@ static void restart(upb_daemon *d, const upb_packet_info *info, uint64_t receive
     begin_sequence(d, info, received_ns);
 }
 
-/* UPB_DROPS: take it. */
+static int in_flood(const upb_daemon *d, uint64_t received_ns) {
+    return received_ns < d->health.flood_until_ns && daemon_detects(d, UPB_FAULT_NET_FLOOD) &&
+           daemon_reacts(d, REACT_FLOOD);
+}
+
+/* UPB_DROPS: take it. No packet of the sensor is refused for ever: what others confirm is taken, in a flood as well. */
 static uint32_t judge_order(upb_daemon *d, const upb_packet_info *info, uint64_t received_ns) {
     packet_sequence *s = &d->sequence;
     if (!s->started) {
@@ -88,20 +95,23 @@ static uint32_t judge_order(upb_daemon *d, const upb_packet_info *info, uint64_t
     const int64_t sent_ns = (int64_t)s->sensor_ns + after * (int64_t)NS_PER_US + s->offset_ns;
     const int is_late = after <= 0 && after > -LATE_US;
     const int is_jump = after <= -LATE_US || sent_ns - (int64_t)received_ns > AHEAD_NS;
+    const int flood = in_flood(d, received_ns);
+    const int is_doubtful = flood && !continues(d, s->time_us, info->time_us);
     if (is_late && !daemon_reacts(d, REACT_LATE))
         return UPB_DROPS;
-    if ((is_late || is_jump) && d->sensor_silent) { /* it was switched off: nobody expects its clock to go on */
+    if (!is_late && !is_jump && !is_doubtful) {
+        s->candidate_count = 0;
+        return UPB_DROPS;
+    }
+    const int is_back = d->sensor_silent && (is_late || is_jump); /* it was off: nobody expects its clock to go on */
+    if ((!is_back || flood) &&
+        (!daemon_reacts(d, REACT_RESYNC) || !is_confirmed(d, info, is_jump && !flood ? CONFIRM_JUMP : CONFIRM_LATE)))
+        return flood ? UPB_DROP_FLOOD : is_jump ? UPB_DROP_JUMP : UPB_DROP_LATE;
+    if (is_back) {
         daemon_forget_turn(d);
         begin_sequence(d, info, received_ns);
-        return UPB_DROPS;
-    }
-    if (is_late || is_jump) {
-        if (!daemon_reacts(d, REACT_RESYNC) || !is_confirmed(d, info, is_jump ? CONFIRM_JUMP : CONFIRM_LATE))
-            return is_jump ? UPB_DROP_JUMP : UPB_DROP_LATE;
+    } else if (is_late || is_jump)
         restart(d, info, received_ns);
-        return UPB_DROPS;
-    }
-    s->candidate_count = 0;
     return UPB_DROPS;
 }
 
@@ -162,7 +172,8 @@ static void refuse(upb_daemon *d, uint32_t drop, uint64_t received_ns) {
         h->flood_window_ns = received_ns;
         h->flood_count = 0;
     }
-    const uint64_t sent = NS_PER_S / ((uint64_t)d->cycle_ns * d->packet_firings);
+    /* A quarter more than the sensor sends: one whose own packets are all refused is no flood. */
+    const uint64_t sent = NS_PER_S * 5 / 4 / ((uint64_t)d->cycle_ns * d->packet_firings);
     const uint64_t per_second = d->config.flood_per_second ? d->config.flood_per_second : sent;
     if (++h->flood_count * (NS_PER_S / FLOOD_WINDOW_NS) > per_second) {
         h->flood_until_ns = received_ns + FLOOD_HOLD_NS;
@@ -170,9 +181,9 @@ static void refuse(upb_daemon *d, uint32_t drop, uint64_t received_ns) {
     }
 }
 
-static int in_flood(const upb_daemon *d, uint64_t received_ns) {
-    return received_ns < d->health.flood_until_ns && daemon_detects(d, UPB_FAULT_NET_FLOOD) &&
-           daemon_reacts(d, REACT_FLOOD);
+static int is_stuck(const upb_daemon *d) {
+    return d->stuck_run >= STUCK_RUN && daemon_detects(d, UPB_FAULT_SENSOR_AZIMUTH_STUCK) &&
+           daemon_reacts(d, REACT_STUCK);
 }
 
 static int is_stuck(const upb_daemon *d) {
@@ -185,7 +196,7 @@ static int is_stuck_there(const upb_daemon *d, const upb_packet_info *info) {
     return is_stuck(d) && (apart < 100 || apart > UPB_FULL_TURN_MDEG - 100);
 }
 
-static uint32_t drop_of(upb_packet_status status) {
+static uint32_t drop_of_status(upb_packet_status status) {
     switch (status) {
     case UPB_PACKET_OK:
         return UPB_DROPS;
@@ -202,12 +213,13 @@ static uint32_t drop_of(upb_packet_status status) {
     }
 }
 
-/* During a flood: does the packet continue the sequence, or one that came back? The sensor may have been away. */
-static int is_the_sensors(upb_daemon *d, upb_packet_status status, const upb_packet_info *info) {
-    if (status != UPB_PACKET_OK || info->kind != UPB_PACKET_KIND_DATA || (uint32_t)info->sensor != d->config.sensor)
-        return 0;
-    return !d->sequence.started || continues(d, d->sequence.time_us, info->time_us) ||
-           is_confirmed(d, info, CONFIRM_LATE);
+/* UPB_DROPS: a data packet of the sensor. */
+static uint32_t drop_of(const upb_daemon *d, upb_packet_status status, const upb_packet_info *info) {
+    if (status != UPB_PACKET_OK)
+        return drop_of_status(status);
+    if (info->kind != UPB_PACKET_KIND_DATA)
+        return UPB_DROP_MALFORMED; /* a position packet on the data port */
+    return (uint32_t)info->sensor == d->config.sensor ? UPB_DROPS : UPB_DROP_WRONG_MODEL;
 }
 
 /* UPB_DROPS: take it. */
@@ -218,14 +230,9 @@ static uint32_t judge(upb_daemon *d, const uint8_t *data, size_t bytes, uint32_t
     if (d->config.source_ipv4 && source_ipv4 != d->config.source_ipv4 && daemon_reacts(d, REACT_SOURCE))
         return UPB_DROP_WRONG_SOURCE;
     const upb_packet_status status = upb_packet_identify(data, bytes, info);
-    if (in_flood(d, received_ns) && !is_the_sensors(d, status, info))
-        return UPB_DROP_FLOOD;
-    if (status != UPB_PACKET_OK)
-        return drop_of(status);
-    if (info->kind != UPB_PACKET_KIND_DATA)
-        return UPB_DROP_MALFORMED; /* a position packet on the data port */
-    if ((uint32_t)info->sensor != d->config.sensor)
-        return UPB_DROP_WRONG_MODEL;
+    const uint32_t drop = drop_of(d, status, info);
+    if (drop != UPB_DROPS)
+        return in_flood(d, received_ns) ? UPB_DROP_FLOOD : drop;
     if (is_stuck_there(d, info))
         return UPB_DROP_STUCK;
     return judge_order(d, info, received_ns);
@@ -270,11 +277,9 @@ static void work(upb_daemon *d, const upb_firing *firings, uint32_t count, uint6
         daemon_time_at_least(d, begin_ns + service_ns);
     d->busy_until_ns = d->heard_ns = daemon_now(d);
     daemon_ladder_worked(d, d->busy_until_ns - begin_ns);
-    d->health.now.service_ns += d->busy_until_ns - begin_ns;
-    d->health.now.service_packets++;
-    if (mode != d->ladder.mode) { /* a mean over two modes says nothing */
-        d->health.now.service_ns = 0;
-        d->health.now.service_packets = 0;
+    if (mode == d->ladder.mode) {
+        d->health.now.service_ns += d->busy_until_ns - begin_ns;
+        d->health.now.service_packets++;
     }
 }
 
@@ -302,18 +307,15 @@ void upb_daemon_packet(upb_daemon *d, const uint8_t *data, size_t bytes, uint32_
         daemon_forget_turn(d);
     take_into_sequence(d, &info, received_ns);
     d->sensor_silent = 0;
-    const uint32_t mode_before = d->ladder.mode;
     const uint64_t begin_ns = begin_work(d, received_ns);
     daemon_ladder_look(d, begin_ns);
-    if (mode_before != d->ladder.mode)
-        d->health.now.service_ns = d->health.now.service_packets = 0;
     if (d->lag_ns >= d->config.stale_ns && daemon_reacts(d, REACT_STALE)) {
         refuse(d, UPB_DROP_STALE, received_ns);
         return;
     }
     const upb_packet_status status = upb_packet_decode(&d->decoder, data, bytes, firings, &count, NULL);
     if (status != UPB_PACKET_OK) {
-        refuse(d, drop_of(status), received_ns);
+        refuse(d, drop_of_status(status), received_ns);
         return;
     }
     d->counters.packets_processed++;

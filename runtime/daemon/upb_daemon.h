@@ -131,7 +131,7 @@ typedef struct upb_daemon_config {
     /* health: what sets and heals each fault is in docs/upbeamd.md */
     uint64_t timeout_ns; /* without a packet this long (beside the blind part of a turn): SENSOR_TIMEOUT, and what is
                             pending leaves */
-    uint32_t flood_per_second;    /* refused packets above it: NET_FLOOD; 0: as many as the sensor sends */
+    uint32_t flood_per_second;    /* refused packets above it: NET_FLOOD; 0: 1.25 times what the sensor sends */
     uint64_t jitter_ns;           /* arrival against sensor time, of one packet to the next: NET_JITTER */
     uint32_t drift_ppm;           /* sensor clock against ours: CLOCK_DRIFT */
     uint32_t loss_permille;       /* firings inserted in a frame: NET_LOSS */

@@ -58,7 +58,7 @@ static const setting table[] = {
     {"stale_ms", MILLISECONDS, OF(daemon.stale_ns), "a packet that waited longer is dropped", NULL, 0},
     {"timeout_ms", MILLISECONDS, OF(daemon.timeout_ns), "silence of the sensor, then SENSOR_TIMEOUT", NULL, 0},
     {"flood_per_second", NUMBER, OF(daemon.flood_per_second),
-     "refused packets, then NET_FLOOD; 0: as many as the sensor sends", NULL, 0},
+     "refused packets, then NET_FLOOD; 0: 1.25 times what the sensor sends", NULL, 0},
     {"jitter_ms", MILLISECONDS, OF(daemon.jitter_ns), "arrival against sensor time, then NET_JITTER", NULL, 0},
     {"drift_ppm", NUMBER, OF(daemon.drift_ppm), "sensor clock against ours, then CLOCK_DRIFT", NULL, 0},
     {"loss_permille", NUMBER, OF(daemon.loss_permille), "firings of a frame that never came, then NET_LOSS", NULL, 0},

@@ -361,6 +361,120 @@ static void test_arguments(const uint8_t *ubm, size_t ubm_bytes) {
     free(memory);
 }
 
+/* ---------------------------------------------------------------------------------------------- recovery */
+
+enum {
+    PACKET_NS = 552960,
+    RECOVERY_PACKETS = 5425, /* 3 s */
+    HEARD_PACKETS = 400,     /* 0.22 s: from then on every packet is taken */
+    SETTLED_PACKETS = 1900   /* 1.05 s: from then on no break, and no packet misses a column */
+};
+
+/* What is wrong in a stretch of packets, all at once. */
+typedef enum trouble {
+    OTHER_MODEL = 1,
+    STANDS_STILL = 2,
+    MUTATED = 4,
+    DISTURBED = 8,
+    JUNK_FLOOD = 16,
+    ECHO_FLOOD = 32,
+    SILENT = 64,
+    CLOCK_SET = 128,
+    TROUBLES = 256
+} trouble;
+
+static void flood(bench *b, uint32_t troubles) {
+    uint8_t bytes[UPB_PACKET_BYTES];
+    for (uint32_t n = random_below(&b->random, 8); n; n--) {
+        memset(bytes, 0, sizeof bytes);
+        if (troubles & ECHO_FLOOD)
+            memcpy(bytes, b->recent[random_below(&b->random, RECENT)], sizeof bytes);
+        upb_daemon_packet(b->daemon, bytes, sizeof bytes, 0, b->now_ns);
+    }
+}
+
+static void suffer(bench *b, uint32_t troubles, uint32_t packets) {
+    uint8_t bytes[UPB_PACKET_BYTES + 200];
+    if (troubles & STANDS_STILL)
+        b->step_mdeg = 0;
+    if (troubles & CLOCK_SET) /* by up to an hour, or a little back */
+        b->sensor_ns += random_below(&b->random, 2) ? (uint64_t)random_u32(&b->random) * 838
+                                                    : UINT64_C(3600000000000) - random_below(&b->random, 200000000);
+    for (uint32_t i = 0; i < packets; i++) {
+        memset(bytes, 0, sizeof bytes);
+        next_packet(b, bytes);
+        b->now_ns += PACKET_NS;
+        if (troubles & OTHER_MODEL)
+            bytes[1205] = 0x28;
+        const int bad = troubles & MUTATED && random_below(&b->random, 3) == 0;
+        const size_t size = bad ? mutate(b, bytes) : UPB_PACKET_BYTES;
+        if (!(troubles & SILENT))
+            upb_daemon_packet(b->daemon, bytes, size, 0, b->now_ns);
+        if (troubles & (JUNK_FLOOD | ECHO_FLOOD))
+            flood(b, troubles);
+        if (troubles & DISTURBED && random_below(&b->random, 40) == 0)
+            disturb(b);
+        if (i % 16 == 0)
+            upb_daemon_tick(b->daemon, b->now_ns);
+    }
+}
+
+/* A healthy sensor is heard again: whatever was wrong before. */
+static void recover(bench *b, const char *after) {
+    const uint64_t service[UPB_MODES] = {100000};
+    uint8_t packet[UPB_PACKET_BYTES];
+    upb_daemon_counters heard = {0}, settled = {0};
+    int ok = 1;
+    b->step_mdeg = 166;
+    upb_daemon_set_service(b->daemon, service);
+    upb_daemon_set_floor(b->daemon, UPB_MODE_NETWORK, b->now_ns);
+    for (unsigned i = 0; i < RECOVERY_PACKETS; i++) {
+        if (i == HEARD_PACKETS)
+            heard = upb_daemon_get_status(b->daemon).counters;
+        if (i == SETTLED_PACKETS)
+            settled = upb_daemon_get_status(b->daemon).counters;
+        next_packet(b, packet);
+        b->now_ns += PACKET_NS;
+        upb_daemon_packet(b->daemon, packet, sizeof packet, 0, b->now_ns);
+        if (i % 16 == 0)
+            upb_daemon_tick(b->daemon, b->now_ns);
+    }
+    const upb_daemon_counters c = upb_daemon_get_status(b->daemon).counters;
+    const uint64_t since = RECOVERY_PACKETS - SETTLED_PACKETS;
+    ok &= CHECK_EQUAL(c.packets_processed - heard.packets_processed, RECOVERY_PACKETS - HEARD_PACKETS);
+    ok &= CHECK_EQUAL(c.resyncs, settled.resyncs);
+    ok &= CHECK_EQUAL(c.firings_processed - settled.firings_processed, 12 * since);
+    ok &= CHECK_EQUAL(c.firings_inserted + c.firings_skipped, settled.firings_inserted + settled.firings_skipped);
+    ok &= CHECK_EQUAL(c.frames_partial + c.frames_skipped + c.frames_forced,
+                      settled.frames_partial + settled.frames_skipped + settled.frames_forced);
+    const uint32_t columns = upb_daemon_get_status(b->daemon).columns;
+    ok &= CHECK(columns > 2100 && columns < 2240);
+    if (!ok)
+        printf("  after %s\n", after);
+}
+
+static void run_recovery(const uint8_t *ubm, size_t ubm_bytes, uint64_t seed, unsigned long rounds) {
+    static bench b;
+    char after[200];
+    begin(&b, ubm, ubm_bytes, seed);
+    suffer(&b, 0, 2 * RECENT);
+    for (unsigned long round = 0; round < rounds; round++) {
+        int length = snprintf(after, sizeof after, "round %lu, troubles", round);
+        for (uint32_t stretch = 1 + random_below(&b.random, 3); stretch; stretch--) {
+            /* One alone, or any together. */
+            const uint32_t troubles =
+                random_below(&b.random, 2) ? 1u << random_below(&b.random, 8) : random_below(&b.random, TROUBLES);
+            const uint32_t packets = 1 + random_below(&b.random, 1200);
+            length += snprintf(after + length, sizeof after - (size_t)length, " %u for %u packets;", troubles, packets);
+            suffer(&b, troubles, packets);
+            check_books(&b);
+        }
+        recover(&b, after);
+    }
+    check_end(&b);
+    free(b.memory);
+}
+
 int main(int argc, char **argv) {
     const unsigned long seed = option_number(argc, argv, "--seed", 1),
                         count = option_number(argc, argv, "--count", 100000);
@@ -370,6 +484,7 @@ int main(int argc, char **argv) {
     printf("seed %lu, %lu packets\n", seed, count);
     test_arguments(ubm, bytes);
     run(ubm, bytes, seed, count);
+    run_recovery(ubm, bytes, seed, 1 + count / 2500);
     run_models(ubm, bytes, seed);
     run_integrity(ubm, bytes, seed);
     free(ubm);
