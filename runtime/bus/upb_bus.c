@@ -247,6 +247,8 @@ upb_status upb_bus_init(upb_bus *bus, const upb_bus_config *config, uint64_t now
         upb_isotp_init(&bus->isotp, &config->isotp, &can) != UPB_OK ||
         upb_uds_init(&bus->uds, &uds, &bus->faults) != UPB_OK)
         return UPB_E_ARGUMENT;
+    if (config->muted_faults)
+        upb_faults_mute(&bus->faults, config->muted_faults);
     upb_console_parser_init(&bus->parser);
     upb_sender_init(&bus->can, now_ns);
     upb_sender_init(&bus->serial, now_ns);

@@ -227,7 +227,7 @@ static int count_look(int counter, upb_debounce debounce, upb_monitor look) {
 }
 
 int upb_faults_report(upb_faults *faults, uint32_t id, upb_monitor look, uint64_t now_ns) {
-    if (id < 1 || id > UPB_FAULTS || look > UPB_MONITOR_FAILED)
+    if (id < 1 || id > UPB_FAULTS || look > UPB_MONITOR_FAILED || faults->muted >> (id - 1) & 1)
         return 0;
     upb_fault_entry *entry = &faults->entries[id];
     const uint8_t before = entry->status;
@@ -275,4 +275,11 @@ upb_status upb_faults_clear(upb_faults *faults, uint32_t id) {
         faults->latest = 0;
     faults->dirty = UPB_FAULTS_SOON;
     return UPB_OK;
+}
+
+void upb_faults_mute(upb_faults *faults, uint64_t mask) {
+    faults->muted = mask;
+    for (uint32_t id = 1; id <= UPB_FAULTS; id++)
+        if (mask >> (id - 1) & 1)
+            upb_faults_clear(faults, id);
 }

@@ -57,6 +57,7 @@ upb_status daemon_bus_init(upb_daemon *d) {
     config.storage = d->config.storage;
     config.key = d->config.key;
     config.execute = execute;
+    config.muted_faults = d->config.sabotage & ((UINT64_C(1) << UPB_FAULTS) - 1);
     config.reset = d->config.reset ? reset : NULL;
     config.user = d;
     return upb_bus_init(&d->bus, &config, d->now_ns);
@@ -111,15 +112,13 @@ static upb_bus_snapshot snapshot_of(const upb_daemon *d) {
 
 _Static_assert(UPB_DROPS <= UPB_DROP_CAUSES_MAX, "every cause has its counter on the bus");
 
-/* Faults that the bus looks for itself: their events, and their sabotage. */
+/* Faults that the bus looks for itself: their events. */
 void daemon_note_bus_faults(upb_daemon *d, uint64_t before) {
     static const upb_fault own[] = {UPB_FAULT_CAN_BUS_OFF, UPB_FAULT_CAN_COMMAND_REJECTED, UPB_FAULT_SERIAL_FRAMING,
                                     UPB_FAULT_POWER_RESET};
+    const uint64_t now = upb_faults_active(&d->bus.faults);
     for (size_t i = 0; i < sizeof own / sizeof own[0]; i++) {
         const uint64_t bit = UINT64_C(1) << (own[i] - 1);
-        if (!daemon_detects(d, own[i]))
-            upb_faults_clear(&d->bus.faults, (uint32_t)own[i]);
-        const uint64_t now = upb_faults_active(&d->bus.faults);
         if (!((before ^ now) & bit))
             continue;
         d->faults_ever |= now & bit;

@@ -167,7 +167,9 @@ upb_daemon_config upb_daemon_config_default(void);
 
 /*
  * Names of what config.sabotage takes out, in the order of its bits: detections (the names of faults in lower case,
- * "sensor_timeout") and reactions ("react_..."). Null after the last.
+ * "sensor_timeout") and reactions ("react_..."). Null after the last. A fault taken out is not found, remembered or
+ * told anywhere. "react_model_check" takes out the check that a model is for this sensor; a file's own checks (format,
+ * lengths, CRC-32) keep memory safe and cannot be taken out.
  */
 const char *upb_daemon_check_name(uint32_t bit);
 

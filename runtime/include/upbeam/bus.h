@@ -136,6 +136,7 @@ typedef struct upb_bus_config {
     int (*reset)(void *user, uint32_t type); /* upb_uds_config.reset; null: ECUReset is refused */
     void *user;                              /* of execute and reset */
     uint32_t clear_locked;                   /* upb_uds_config.clear_locked */
+    uint64_t muted_faults;                   /* upb_faults_mute: 0, but in tests of tests */
     upb_isotp_config isotp;                  /* identifiers and timeouts of diagnostics */
 } upb_bus_config;
 

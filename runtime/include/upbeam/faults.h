@@ -108,6 +108,7 @@ typedef struct upb_faults {
     uint32_t store_failures; /* writes refused, and a stored memory that could not be read */
     uint64_t frame;          /* upb_faults_context */
     uint32_t mode;
+    uint64_t muted; /* bit id-1: upb_faults_mute */
 } upb_faults;
 
 #define UPB_FAULTS_AGE_CYCLES 40u /* operation cycles without the fault after which it is no longer confirmed */
@@ -122,6 +123,11 @@ UPB_API upb_status upb_faults_init(upb_faults *faults, const upb_storage *storag
 UPB_API void upb_faults_context(upb_faults *faults, uint64_t frame, uint32_t mode);
 /* A monitor's look. True if testFailed changed. Unknown ids are ignored. */
 UPB_API int upb_faults_report(upb_faults *faults, uint32_t id, upb_monitor look, uint64_t now_ns);
+/*
+ * To test tests: looks at the faults whose bit id-1 is set are ignored from now on, and what is remembered of them is
+ * forgotten. Replaces the mask of the call before.
+ */
+UPB_API void upb_faults_mute(upb_faults *faults, uint64_t mask);
 UPB_API int upb_fault_is_active(const upb_faults *faults, uint32_t id);
 /* Bit id-1 for each fault whose test fails now. */
 UPB_API uint64_t upb_faults_active(const upb_faults *faults);

@@ -111,3 +111,51 @@ def test_can_tells_what_the_ledger_and_the_counters_tell() -> None:
     assert [MODES[record["Mode"]] for record in on_can] == [record["mode"] for record in out.ledger]
     assert [VERDICTS[record["Verdict"]] for record in on_can] == [record["verdict"] for record in out.ledger]
     assert {f.id for f in out.can} >= {0x210, 0x211, 0x212, 0x213, 0x215}
+
+
+def forged(daemon: Daemon, now: int) -> None:
+    daemon.can(COMMAND_ID, command(MODE, 1, 3, key=bytes(16)), now, FD)
+
+
+def garbled(daemon: Daemon, now: int) -> None:
+    for i in range(20):
+        daemon.serial(b"\x07no record of ours\x00", now + i)
+
+
+def cut_off(daemon: Daemon, now: int) -> None:
+    daemon.set_links(can=False)
+
+
+def nothing(daemon: Daemon, now: int) -> None:
+    """The power failed before."""
+
+
+OWN = {
+    "CAN_BUS_OFF": cut_off,
+    "CAN_COMMAND_REJECTED": forged,
+    "SERIAL_FRAMING": garbled,
+    "POWER_RESET": nothing,
+}
+
+
+@pytest.mark.parametrize("fault", OWN)
+@pytest.mark.parametrize("sabotaged", [False, True])
+def test_faults_that_the_bus_finds_can_be_taken_out(fault: str, sabotaged: bool) -> None:
+    """Then nobody is told: no event, nothing on CAN or serial, nothing remembered."""
+    database = cantools.database.load_file(MODELS.parents[1] / "hw_sim" / "can" / "upbeam.dbc")
+    packets = Feed().make(4)
+    before = daemon_for()
+    run(before, packets[:50])
+    restart = {"stored": before.stored()} if fault == "POWER_RESET" else {}
+    daemon = daemon_for(sabotage=[fault.lower()] if sabotaged else [], **restart)
+    now = run(daemon, packets[:100])
+    OWN[fault](daemon, now)
+    run(daemon, packets[100:600])
+    daemon.set_links()
+    out = finish(daemon, run(daemon, packets[600:]))
+    sets = [e["fault"] for e in out.events if e["kind"] == "fault_set"]
+    assert sets == ([] if sabotaged else [fault])
+    assert (fault in daemon.status["faults_ever"]) == (not sabotaged)
+    told = [database.decode_message(f.id, f.data, decode_choices=False) for f in out.can if f.id == 0x213]
+    if fault != "CAN_BUS_OFF":  # while the bus is off, it tells nothing
+        assert any(message[fault] for message in told) == (not sabotaged)

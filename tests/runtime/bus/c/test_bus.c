@@ -257,6 +257,26 @@ static void test_debounce(void) {
     CHECK_EQUAL(upb_faults_count(&faults, UPB_DTC_NOT_COMPLETED_SINCE_CLEAR), UPB_FAULTS);
 }
 
+/* Of muted faults nothing is found, remembered or stored; the others are as ever. */
+static void test_muted_faults(void) {
+    const upb_storage none = {0};
+    upb_faults faults;
+    upb_faults_init(&faults, &none, 0);
+    for (uint32_t id = 1; id <= UPB_FAULTS; id++)
+        upb_faults_report(&faults, id, UPB_MONITOR_FAILED, id);
+    upb_faults_mute(&faults, UINT64_C(0x15555555));
+    for (uint32_t id = 1; id <= UPB_FAULTS; id++) {
+        const int muted = id % 2;
+        CHECK_EQUAL(upb_fault_is_active(&faults, id), !muted);
+        CHECK_EQUAL(faults.entries[id].occurrences, !muted);
+        CHECK_EQUAL(upb_faults_report(&faults, id, UPB_MONITOR_PASSED, 100) != 0, !muted);
+        CHECK_EQUAL(upb_faults_report(&faults, id, UPB_MONITOR_FAILED, 100) != 0, !muted);
+    }
+    CHECK_EQUAL(upb_faults_active(&faults), UINT64_C(0x0aaaaaaa));
+    upb_faults_mute(&faults, 0);
+    CHECK_EQUAL(upb_faults_report(&faults, 1, UPB_MONITOR_FAILED, 200) != 0, 1);
+}
+
 /* Confirmed over restarts, forgotten after 40 cycles in which the test passed; a reset without an end is noticed. */
 static void test_fault_cycles(void) {
     new_device();
@@ -442,6 +462,7 @@ int main(void) {
     test_command_values();
     test_command_storage();
     test_debounce();
+    test_muted_faults();
     test_fault_cycles();
     test_storage_wear();
     test_cycle_times();
