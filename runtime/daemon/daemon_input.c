@@ -186,11 +186,6 @@ static int is_stuck(const upb_daemon *d) {
            daemon_reacts(d, REACT_STUCK);
 }
 
-static int is_stuck(const upb_daemon *d) {
-    return d->stuck_run >= STUCK_RUN && daemon_detects(d, UPB_FAULT_SENSOR_AZIMUTH_STUCK) &&
-           daemon_reacts(d, REACT_STUCK);
-}
-
 static int is_stuck_there(const upb_daemon *d, const upb_packet_info *info) {
     const uint32_t a = d->stuck_azimuth_mdeg, b = info->azimuth_mdeg, apart = a > b ? a - b : b - a;
     return is_stuck(d) && (apart < 100 || apart > UPB_FULL_TURN_MDEG - 100);

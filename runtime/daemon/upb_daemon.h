@@ -42,7 +42,7 @@ typedef enum upb_drop {
     UPB_DROP_WRONG_SOURCE = 2, /* from another address than config.source_ipv4 */
     UPB_DROP_DUPLICATE = 3,    /* the same sensor time and azimuth as one already taken */
     UPB_DROP_LATE = 4,         /* overtaken: older than one already taken */
-    UPB_DROP_FLOOD = 5,        /* during a flood of packets to refuse: neither continues nor begins a sequence */
+    UPB_DROP_FLOOD = 5,        /* during a flood of packets to refuse, one that does not continue the sequence */
     UPB_DROP_QUEUE = 6,        /* the queue before the step was full */
     UPB_DROP_STALE = 7,        /* waited longer than config.stale_ns */
     UPB_DROP_STUCK = 8,        /* the azimuth does not move: the measured directions are unknown */
