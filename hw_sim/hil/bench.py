@@ -169,7 +169,9 @@ class Bench:
 
     def collect(self) -> None:
         """Takes what the device has sent, and passes it on."""
-        for output in self.dut.take():
+        begun_ns = self.record.boots[-1].start_ns
+        for left in self.dut.take():
+            output = left._replace(time_ns=max(left.time_ns, begun_ns))  # a core tells no time before its first call
             self.record.outputs.append(output)
             if output.kind == "can":
                 self._send_on(output)
