@@ -1,7 +1,8 @@
 """Memories and parameters for RTL: what a core needs of a model, generated, nothing typed by hand.
 
 Per precision a folder: ``.mem`` files for ``$readmemh`` (two's complement, exact width, one value a line), a
-SystemVerilog header of local parameters, and beside the folders one manifest.
+SystemVerilog header of local parameters, one of the configuration (LANES, FOLD, the weights in the order of its
+schedule), and beside the folders one manifest.
 """
 
 from __future__ import annotations
@@ -28,13 +29,27 @@ from upbeam.quant.integer import (
 )
 from upbeam.quant.sizes import weight_bytes
 
+from .rtl_schedule import Configuration, Words, words
 from .source import NETWORKS, ExportError, NetworkName, Source, new_folder
 
-__all__ = ["FORMAT", "MANIFEST", "PARAMETERS", "Memory", "memories", "parameters", "write_rtl"]
+__all__ = [
+    "CONFIGURATION",
+    "FORMAT",
+    "MANIFEST",
+    "PARAMETERS",
+    "Memory",
+    "configuration",
+    "configuration_header",
+    "core_headers",
+    "memories",
+    "parameters",
+    "write_rtl",
+]
 
 FORMAT = "upbeam.rtl.v1"
 MANIFEST = "manifest.json"
 PARAMETERS = "upb_params.svh"
+CONFIGURATION = "upb_config.svh"
 SUM_BITS, HIDDEN_BITS, COUNT_BITS, INTENSITY_BITS = 32, 16, 16, 8
 
 I64 = NDArray[np.int64]
@@ -56,15 +71,23 @@ class Memory:
         return "\n".join([f"// {head}", f"// {self.what}; {len(lines)} x {self.bits} bits", *lines, ""])
 
 
-def write_rtl(source: Source, folder: Path, precisions: Sequence[Precision] | None = None) -> dict[str, Any]:
+def write_rtl(
+    source: Source,
+    folder: Path,
+    precisions: Sequence[Precision] | None = None,
+    *,
+    fold: int | None = None,
+    lanes: int = 1,
+) -> dict[str, Any]:
     """Writes ``FOLDER/manifest.json`` and ``FOLDER/PRECISION/...``; returns the manifest.
 
-    ``folder`` must be empty or new. Raises ExportError for that, for a precision the model does not have, and for a
-    model without any."""
+    ``fold``: clocks a window and lane; one hidden unit a clock if omitted. ``folder`` must be empty or new. Raises
+    ExportError for that, for a precision the model does not have, and for a model without any; ConfigurationError for
+    ``fold`` and ``lanes`` that the core does not have."""
     wanted = list(source.precisions if precisions is None else precisions)
     if not wanted:
         raise ExportError(f"{source.name}: no integer networks in this model; upbeam quantize adds them")
-    texts = {precision: _texts(source, source.integer(precision)) for precision in wanted}
+    texts = {precision: _texts(source, source.integer(precision), fold, lanes) for precision in wanted}
     new_folder(folder)
     for precision, files in texts.items():
         (folder / precision).mkdir()
@@ -75,10 +98,19 @@ def write_rtl(source: Source, folder: Path, precisions: Sequence[Precision] | No
     return manifest
 
 
-def _texts(source: Source, model: IntegerModel) -> dict[str, str]:
+def _texts(source: Source, model: IntegerModel, fold: int | None, lanes: int) -> dict[str, str]:
     head = f"{source.name} {source.crc32:08x}, {model.contract}"
-    files = {PARAMETERS: parameters(source, model.precision)}
+    files = core_headers(source, model.precision, fold=fold, lanes=lanes)
     return files | {memory.file: memory.text(head) for memory in memories(model)}
+
+
+def core_headers(source: Source, precision: Precision, *, fold: int | None = None, lanes: int = 1) -> dict[str, str]:
+    """The two headers that ``kernels/rtl/upb_pkg.sv`` includes, by file name."""
+    chosen = configuration(source.integer(precision), fold=fold, lanes=lanes)
+    return {
+        PARAMETERS: parameters(source, precision),
+        CONFIGURATION: configuration_header(source, precision, chosen),
+    }
 
 
 def _manifest(source: Source, texts: dict[Precision, dict[str, str]]) -> dict[str, Any]:
@@ -191,3 +223,44 @@ def _packed(name: str, values: I64) -> str:
     bits = COUNT_BITS * len(values)
     digits = "".join(f"{int(value):04x}" for value in values[::-1])
     return f"localparam [{bits - 1}:0] UPB_{name} = {bits}'h{digits};"
+
+
+# ------------------------------------------------------------------------------------------------ configuration
+
+
+def configuration(model: IntegerModel, *, fold: int | None = None, lanes: int = 1) -> Configuration:
+    """``fold`` omitted: one hidden unit a clock. Raises ConfigurationError."""
+    hidden = max(n.hidden for n in model)
+    leaky = any(n.slope > 0 for n in model)
+    return Configuration(hidden, hidden if fold is None else fold, lanes, leaky)
+
+
+def configuration_header(source: Source, precision: Precision, c: Configuration) -> str:
+    """``upb_config.svh``. Raises ExportError."""
+    model = source.integer(precision)
+    made = [words(n, precision, c, bits) for n, bits in zip(model, (COUNT_BITS, INTENSITY_BITS), strict=True)]
+    lines = [
+        f"// LANES {c.lanes}, FOLD {c.fold} of the {model.contract} networks. Generated from the model file; do not edit.",
+        *(f"// {key}: {text}" for key, text in source.describe()[:1]),
+        f"// {c.multipliers} multipliers a network and lane (FOLD 1: shifts and adds); a window every {c.interval} clocks.",
+        "// Weights in the order of the schedule: quant/export/rtl_schedule.py. Word 0 lowest.",
+        f"localparam [31:0] UPB_CONFIG_CRC32 = 32'h{source.crc32:08x};",
+        *(_integer(name, value) for name, value in (("LANES", c.lanes), ("FOLD", c.fold), ("HIDDEN", c.hidden))),
+        *(_integer(f"STEP_{letter}_BITS", _width(made[0], letter)) for letter in "WMBV"),
+    ]
+    for which, network_words in zip(NETWORKS, made, strict=True):
+        lines += _step_words(which.upper(), network_words)
+    return "\n".join([*lines, ""])
+
+
+def _step_words(which: str, made: Words) -> Iterator[str]:
+    for letter, bits in zip("WMBV", made.bits, strict=True):
+        digits = "".join(f"{int(v) & ((1 << bits) - 1):0{bits // 4}x}" for v in getattr(made, letter)[::-1])
+        width = _width(made, letter)
+        yield f"localparam [{width - 1}:0] UPB_{which}_STEP_{letter} = {width}'h{digits or 0};"
+    yield f"localparam [31:0] UPB_{which}_STEP_C = 32'h{made.C & 0xFFFFFFFF:08x};"
+
+
+def _width(made: Words, letter: str) -> int:
+    """In bits, at least 1: a memory that is not there is one bit, 0."""
+    return max(1, made.bits["WMBV".index(letter)] * len(getattr(made, letter)))

@@ -1,0 +1,116 @@
+"""The simulated core: beats in, beats out, the clock of each."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from upbeam.quant.export.rtl import configuration, core_headers
+from upbeam.quant.export.source import Source
+from upbeam.quant.integer import Precision
+
+from .beats import U8, U16, U32, U64, OutputColumns, image_beats, output_columns
+from .verilator import SimulatorError, build
+
+__all__ = ["EVENTS", "RtlCore", "Run", "Traffic"]
+
+EVENTS = (
+    "columns", "frames", "short_columns", "long_columns", "short_frames", "long_frames", "dropped_beats", "overruns",
+)  # fmt: skip
+_MAGIC = 0x31425055
+_FAILURES = {
+    1: "m_axis_tvalid fell before m_axis_tready",
+    2: "m_axis data changed before m_axis_tready",
+    3: "the run did not end within max_clocks",
+}
+_HEAD = np.dtype(
+    [("magic", "<u4"), ("failed", "<u4"), ("accepted", "<u8"), ("given", "<u8"), ("clocks", "<u8"), ("events", "<u8", 8)]
+)
+_GIVEN = np.dtype([("beat", "<u8"), ("clock", "<u4"), ("rose", "<u4")])
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """What surrounds the core. The same seed gives the same clocks."""
+
+    gap: float = 0.0
+    """share of the clocks at which the source offers nothing new"""
+    stall: float = 0.0
+    """share of the clocks at which the sink is not ready"""
+    stuck: tuple[int, int] = (0, 0)
+    """clocks from, until: the sink takes nothing at all"""
+    seed: int = 1
+
+
+@dataclass(frozen=True)
+class Run:
+    """Of one simulation. Clock 0 is the first after reset."""
+
+    accepted: U32
+    """clock of each accepted input beat"""
+    beats: U64
+    """output beats: bits 0..47 tdata, 48 tlast, 49..50 tuser"""
+    given: U32
+    """clock at which each was taken"""
+    offered: U32
+    """clock at which each was first valid"""
+    clocks: int
+    events: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def columns(self) -> OutputColumns:
+        return output_columns(self.beats)
+
+
+class RtlCore:
+    """A core of one model, precision, FOLD and LANES under Verilator. Built once, kept in the user's cache."""
+
+    def __init__(
+        self, source: Source, precision: Precision, *, fold: int | None = None, lanes: int = 1, trace: bool = False
+    ) -> None:
+        """``fold`` omitted: one hidden unit a clock. Raises ExportError, ConfigurationError and SimulatorError."""
+        self.source = source
+        self.configuration = configuration(source.integer(precision), fold=fold, lanes=lanes)
+        self.program: Path = build(core_headers(source, precision, fold=fold, lanes=lanes), trace=trace)
+
+    def run(
+        self, beats: U32, columns: int, traffic: Traffic | None = None, *, vcd: Path | None = None, timeout_s: float = 600
+    ) -> Run:
+        """``beats``: see ``beats.py``; ``columns`` of a frame. Raises SimulatorError where the core breaks a rule of
+        AXI4-Stream or the simulator fails."""
+        t = traffic or Traffic()
+        options = {
+            "columns": columns, "seed": t.seed, "gap": round(t.gap * 65536), "stall": round(t.stall * 65536),
+            "stuck-from": t.stuck[0], "stuck-until": t.stuck[1], "quiet": 80 * self.configuration.interval + 500,
+        }  # fmt: skip
+        command = [str(self.program), *(text for key, value in options.items() for text in (f"--{key}", str(value)))]
+        if vcd is not None:
+            command += ["--vcd", str(vcd)]
+        done = subprocess.run(
+            command, input=np.ascontiguousarray(beats, "<u4").tobytes(), capture_output=True, timeout=timeout_s, check=False
+        )
+        if done.returncode:
+            raise SimulatorError(f"the simulator ended with status {done.returncode}: {done.stderr.decode()}".rstrip())
+        return _parse(done.stdout)
+
+    def image(self, distance: U16, intensity: U8, traffic: Traffic | None = None) -> tuple[U16, U8]:
+        """An image of its own ``[32, W]`` -> ``[64, W]``: both ends are edges."""
+        width = distance.shape[1]
+        made = self.run(image_beats(distance, intensity, width), width, traffic).columns
+        return made.distance, made.intensity
+
+
+def _parse(data: bytes) -> Run:
+    head = np.frombuffer(data, _HEAD, 1)[0]
+    if head["magic"] != _MAGIC:
+        raise SimulatorError("the simulator's answer does not begin with its mark")
+    if head["failed"]:
+        raise SimulatorError(_FAILURES[int(head["failed"])])
+    accepted: NDArray[np.uint32] = np.frombuffer(data, "<u4", int(head["accepted"]), _HEAD.itemsize)
+    given = np.frombuffer(data, _GIVEN, int(head["given"]), _HEAD.itemsize + accepted.nbytes)
+    events = {name: int(count) for name, count in zip(EVENTS, head["events"], strict=True)}
+    return Run(accepted, given["beat"], given["clock"], given["rose"], int(head["clocks"]), events)
