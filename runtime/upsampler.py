@@ -30,6 +30,7 @@ __all__ = [
     "Model",
     "Upsampler",
     "generated_rows",
+    "hand_down_backend",
     "load_model",
     "need_precision",
     "shipped_models",
@@ -41,7 +42,7 @@ F32 = NDArray[np.float32]
 
 DEFAULT_MODEL = "hdl-64e"
 BACKENDS = ("cpu", "opencl")
-"""Of this version."""
+"""Of this layer; ``hand_down_backend`` adds others."""
 
 
 class Model:
@@ -90,6 +91,17 @@ class Model:
 
     def __repr__(self) -> str:
         return f"Model({self.rules.sensor!r}, {self.columns} columns, crc32 {self.crc32:08x})"
+
+
+MakeImage = Callable[[Model, str], Callable[[U16, U8], tuple[U16, U8]]]
+"""A model and a precision -> what turns images ``[32, W]`` into ``[64, W]``."""
+_handed_down: dict[str, MakeImage] = {}
+
+
+def hand_down_backend(name: str, make: MakeImage) -> None:
+    """Adds a backend of whole images from a layer above, which this one must not know. ``make`` raises ValueError for a
+    precision it does not have."""
+    _handed_down[name] = make
 
 
 def need_precision(model: Model, precision: str) -> None:
@@ -165,14 +177,16 @@ class Upsampler:
         cpu: str = "auto",
     ) -> None:
         """``precision``: ``fp32``, ``int16`` or ``int8``; the integers give the same bits on every machine.
-        ``backend``: ``cpu``, or ``opencl`` (extra ``opencl``; whole images only).
+        ``backend``: ``cpu``; or, whole images only, ``opencl`` (extra ``opencl``) or ``rtl`` (the simulated FPGA core,
+        integers only; extra ``fpga`` and a C++ compiler).
         ``columns``: width of the images where it is not the model's. ``cpu``: force one of ``CPUS``.
 
         Raises ValueError for what the model, this machine or this version does not have.
         """
         need_precision(model, precision)
-        if backend not in BACKENDS:
-            raise ValueError(f"backend {backend!r} is not available, expected one of: {', '.join(BACKENDS)}")
+        if backend not in (*BACKENDS, *_handed_down):
+            names = ", ".join((*BACKENDS, *_handed_down))
+            raise ValueError(f"backend {backend!r} is not available, expected one of: {names}")
         self.model = model
         self.precision = precision
         self.backend = backend
@@ -189,6 +203,8 @@ class Upsampler:
         self._image: Callable[[U16, U8], tuple[U16, U8]] = self._stream.image
         if backend == "opencl":
             self._image = OpenClUpsampler(model.file, precision, self.columns)
+        elif backend in _handed_down:
+            self._image = _handed_down[backend](model, precision)
 
     @property
     def cpu(self) -> str:

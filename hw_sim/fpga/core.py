@@ -14,9 +14,9 @@ from upbeam.quant.export.source import Source
 from upbeam.quant.integer import Precision
 
 from .beats import U8, U16, U32, U64, OutputColumns, image_beats, output_columns
-from .verilator import SimulatorError, build
+from .simulators import Simulator, build
 
-__all__ = ["EVENTS", "RtlCore", "Run", "Traffic"]
+__all__ = ["EVENTS", "RtlCore", "Run", "SimulationError", "Traffic"]
 
 EVENTS = (
     "columns", "frames", "short_columns", "long_columns", "short_frames", "long_frames", "dropped_beats", "overruns",
@@ -28,9 +28,16 @@ _FAILURES = {
     3: "the run did not end within max_clocks",
 }
 _HEAD = np.dtype(
-    [("magic", "<u4"), ("failed", "<u4"), ("accepted", "<u8"), ("given", "<u8"), ("clocks", "<u8"), ("events", "<u8", 8)]
-)
+    [
+        ("magic", "<u4"), ("failed", "<u4"), ("accepted", "<u8"), ("given", "<u8"), ("clocks", "<u8"),
+        ("gaps", "<u8"), ("stalls", "<u8"), ("events", "<u8", len(EVENTS)),
+    ]
+)  # fmt: skip
 _GIVEN = np.dtype([("beat", "<u8"), ("clock", "<u4"), ("rose", "<u4")])
+
+
+class SimulationError(RuntimeError):
+    """The core broke a rule of AXI4-Stream, or the simulator failed."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,10 @@ class Run:
     offered: U32
     """clock at which each was first valid"""
     clocks: int
+    gaps: int
+    """clocks at which the source offered nothing, before its last beat"""
+    stalls: int
+    """clocks at which the sink was not ready, before its last beat"""
     events: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -67,21 +78,33 @@ class Run:
 
 
 class RtlCore:
-    """A core of one model, precision, FOLD and LANES under Verilator. Built once, kept in the user's cache."""
+    """A simulated core of one model, precision, FOLD and LANES. Built once, kept in the user's cache."""
 
     def __init__(
-        self, source: Source, precision: Precision, *, fold: int | None = None, lanes: int = 1, trace: bool = False
+        self,
+        source: Source,
+        precision: Precision,
+        *,
+        fold: int | None = None,
+        lanes: int = 1,
+        simulator: Simulator = "verilator",
+        trace: bool = False,
     ) -> None:
-        """``fold`` omitted: one hidden unit a clock. Raises ExportError, ConfigurationError and SimulatorError."""
-        self.source = source
+        """``fold`` omitted: one hidden unit a clock. ``trace``: ``run`` can write a VCD.
+
+        Raises ExportError, ConfigurationError and ToolError."""
         self.configuration = configuration(source.integer(precision), fold=fold, lanes=lanes)
-        self.program: Path = build(core_headers(source, precision, fold=fold, lanes=lanes), trace=trace)
+        headers = core_headers(source, precision, fold=fold, lanes=lanes)
+        self.program: Path = build(headers, simulator, trace=trace)
+        self.trace = trace
 
     def run(
         self, beats: U32, columns: int, traffic: Traffic | None = None, *, vcd: Path | None = None, timeout_s: float = 600
     ) -> Run:
-        """``beats``: see ``beats.py``; ``columns`` of a frame. Raises SimulatorError where the core breaks a rule of
+        """``beats``: see ``beats.py``; ``columns`` of a frame. Raises SimulationError where the core breaks a rule of
         AXI4-Stream or the simulator fails."""
+        if vcd is not None and not self.trace:
+            raise ValueError("this simulator was built without trace")
         t = traffic or Traffic()
         options = {
             "columns": columns, "seed": t.seed, "gap": round(t.gap * 65536), "stall": round(t.stall * 65536),
@@ -94,7 +117,7 @@ class RtlCore:
             command, input=np.ascontiguousarray(beats, "<u4").tobytes(), capture_output=True, timeout=timeout_s, check=False
         )
         if done.returncode:
-            raise SimulatorError(f"the simulator ended with status {done.returncode}: {done.stderr.decode()}".rstrip())
+            raise SimulationError(f"the simulator ended with status {done.returncode}: {done.stderr.decode()}".rstrip())
         return _parse(done.stdout)
 
     def image(self, distance: U16, intensity: U8, traffic: Traffic | None = None) -> tuple[U16, U8]:
@@ -107,10 +130,11 @@ class RtlCore:
 def _parse(data: bytes) -> Run:
     head = np.frombuffer(data, _HEAD, 1)[0]
     if head["magic"] != _MAGIC:
-        raise SimulatorError("the simulator's answer does not begin with its mark")
+        raise SimulationError("the simulator's answer does not begin with its mark")
     if head["failed"]:
-        raise SimulatorError(_FAILURES[int(head["failed"])])
+        raise SimulationError(_FAILURES[int(head["failed"])])
     accepted: NDArray[np.uint32] = np.frombuffer(data, "<u4", int(head["accepted"]), _HEAD.itemsize)
     given = np.frombuffer(data, _GIVEN, int(head["given"]), _HEAD.itemsize + accepted.nbytes)
     events = {name: int(count) for name, count in zip(EVENTS, head["events"], strict=True)}
-    return Run(accepted, given["beat"], given["clock"], given["rose"], int(head["clocks"]), events)
+    clocks, gaps, stalls = (int(head[name]) for name in ("clocks", "gaps", "stalls"))
+    return Run(accepted, given["beat"], given["clock"], given["rose"], clocks, gaps, stalls, events)

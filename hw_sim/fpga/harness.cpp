@@ -1,4 +1,5 @@
-// Drives upb_core clock by clock under Verilator: beats from standard input, what came of them to standard output.
+// Drives upb_core clock by clock, under Verilator or (UPB_CXXRTL) as the C++ that Yosys writes: beats from standard input, what
+// came of them to standard output.
 //
 // Input:  little-endian uint32 a beat: bits 0..23 tdata, 24 tlast, 25..26 tuser.
 // Output: a Head, then the clock at which each input beat was accepted (uint32), then 16 bytes for each output beat:
@@ -12,10 +13,14 @@
 #include <memory>
 #include <vector>
 
+#ifdef UPB_CXXRTL
+#include "upb_core_cxxrtl.cpp"
+#else
 #include "Vupb_core.h"
 #include "verilated.h"
 #if VM_TRACE
 #include "verilated_vcd_c.h"
+#endif
 #endif
 
 namespace {
@@ -33,6 +38,7 @@ struct Options {
 struct Head {
     std::uint32_t magic, failed;  // failed: 1 valid fell before ready, 2 data changed before ready, 3 too many clocks
     std::uint64_t accepted, given, clocks;
+    std::uint64_t gaps, stalls;   // clocks without an offer before the last beat; clocks of a sink that was not ready, before its last
     std::uint64_t events[8];      // columns, frames, short column, long column, short frame, long frame, dropped, overrun
 };
 
@@ -56,13 +62,61 @@ class Random {
     std::uint64_t state_;
 };
 
+#ifdef UPB_CXXRTL
+// Ports as plain values around the model that Yosys wrote.
+class Core {
+  public:
+    std::uint32_t aclk = 0, aresetn = 0, cfg_columns = 0, s_axis_tvalid = 0, s_axis_tdata = 0, s_axis_tlast = 0, s_axis_tuser = 0;
+    std::uint32_t m_axis_tready = 0, s_axis_tready = 0, m_axis_tvalid = 0, m_axis_tlast = 0, m_axis_tuser = 0;
+    std::uint64_t m_axis_tdata = 0;
+    std::uint32_t ev_column = 0, ev_frame = 0, ev_short_column = 0, ev_long_column = 0;
+    std::uint32_t ev_short_frame = 0, ev_long_frame = 0, ev_dropped = 0, ev_overrun = 0;
+
+    void eval() {
+        top_.p_aclk.set(aclk);
+        top_.p_aresetn.set(aresetn);
+        top_.p_cfg__columns.set(cfg_columns);
+        top_.p_s__axis__tvalid.set(s_axis_tvalid);
+        top_.p_s__axis__tdata.set(s_axis_tdata);
+        top_.p_s__axis__tlast.set(s_axis_tlast);
+        top_.p_s__axis__tuser.set(s_axis_tuser);
+        top_.p_m__axis__tready.set(m_axis_tready);
+        top_.step();
+        s_axis_tready = value(top_.p_s__axis__tready);
+        m_axis_tvalid = value(top_.p_m__axis__tvalid);
+        m_axis_tlast = value(top_.p_m__axis__tlast);
+        m_axis_tuser = value(top_.p_m__axis__tuser);
+        m_axis_tdata = wide(top_.p_m__axis__tdata);
+        ev_column = value(top_.p_ev__column);
+        ev_frame = value(top_.p_ev__frame);
+        ev_short_column = value(top_.p_ev__short__column);
+        ev_long_column = value(top_.p_ev__long__column);
+        ev_short_frame = value(top_.p_ev__short__frame);
+        ev_long_frame = value(top_.p_ev__long__frame);
+        ev_dropped = value(top_.p_ev__dropped);
+        ev_overrun = value(top_.p_ev__overrun);
+    }
+
+  private:
+    // A port is a value<N>, or a wire<N> that holds one.
+    template <std::size_t N> static std::uint64_t wide(const cxxrtl::value<N> &port) {
+        return port.data[0] | (N > 32 ? static_cast<std::uint64_t>(port.data[N > 32 ? 1 : 0]) << 32 : 0);
+    }
+    template <std::size_t N> static std::uint64_t wide(const cxxrtl::wire<N> &port) { return wide(port.curr); }
+    template <class Port> static std::uint32_t value(const Port &port) { return static_cast<std::uint32_t>(wide(port)); }
+    cxxrtl_design::p_upb__core top_;
+};
+#else
+using Core = Vupb_core;
+#endif
+
 class Bench {
   public:
     Bench(const Options &options, std::vector<std::uint32_t> beats)
         : options_(options), beats_(std::move(beats)), random_(options.seed) {
 #if VM_TRACE
         if (options.vcd) {
-            context_.traceEverOn(true);
+            Verilated::traceEverOn(true);
             core_.trace(&trace_, 99);
             trace_.open(options.vcd);
         }
@@ -87,7 +141,7 @@ class Bench {
 
   private:
     void half(int level) {
-        core_.aclk = static_cast<CData>(level);
+        core_.aclk = level != 0;
         core_.eval();
 #if VM_TRACE
         if (options_.vcd) trace_.dump(time_);
@@ -97,7 +151,7 @@ class Bench {
 
     void reset() {
         core_.aresetn = 0;
-        core_.cfg_columns = static_cast<SData>(options_.columns);
+        core_.cfg_columns = static_cast<std::uint16_t>(options_.columns);
         core_.s_axis_tvalid = 0;
         core_.m_axis_tready = 0;
         for (int n = 0; n < kResetClocks; n++) {
@@ -118,6 +172,7 @@ class Bench {
         if (in) accepted_.push_back(static_cast<std::uint32_t>(clock_));
         if (out) given_.push_back({beat(), static_cast<std::uint32_t>(clock_), rose_});
         count();
+        tally(out);
         was_valid_ = core_.m_axis_tvalid && !out;
         was_beat_ = beat();
         half(1);
@@ -137,7 +192,7 @@ class Bench {
             const std::uint32_t word = beats_[next_];
             core_.s_axis_tdata = word & 0xFFFFFF;
             core_.s_axis_tlast = (word >> 24) & 1;
-            core_.s_axis_tuser = static_cast<CData>((word >> 25) & 3);
+            core_.s_axis_tuser = (word >> 25) & 3;
         }
         const bool stuck = clock_ >= options_.stuck_from && clock_ < options_.stuck_until;
         core_.m_axis_tready = !stuck && !random_.once_in(options_.stall);
@@ -154,8 +209,18 @@ class Bench {
         if (core_.m_axis_tvalid && !was_valid_) rose_ = static_cast<std::uint32_t>(clock_);
     }
 
+    // Stalls after the last output beat delay nothing: they count once another beat is taken.
+    void tally(bool out) {
+        head_.gaps += next_ < beats_.size() && !core_.s_axis_tvalid;
+        pending_stalls_ += !core_.m_axis_tready;
+        if (out) {
+            head_.stalls += pending_stalls_;
+            pending_stalls_ = 0;
+        }
+    }
+
     void count() {
-        const CData now[8] = {core_.ev_column,      core_.ev_frame,      core_.ev_short_column, core_.ev_long_column,
+        const std::uint64_t now[8] = {core_.ev_column,      core_.ev_frame,      core_.ev_short_column, core_.ev_long_column,
                               core_.ev_short_frame, core_.ev_long_frame, core_.ev_dropped,      core_.ev_overrun};
         for (int n = 0; n < 8; n++) head_.events[n] += now[n];
     }
@@ -174,12 +239,11 @@ class Bench {
     Options options_;
     std::vector<std::uint32_t> beats_;
     Random random_;
-    VerilatedContext context_;
-    Vupb_core core_{&context_};
 #if VM_TRACE
     VerilatedVcdC trace_;
 #endif
-    std::uint64_t clock_ = 0, time_ = 0, last_moved_ = 0, was_beat_ = 0;
+    Core core_;
+    std::uint64_t clock_ = 0, time_ = 0, last_moved_ = 0, was_beat_ = 0, pending_stalls_ = 0;
     std::size_t next_ = 0;
     bool offering_ = false, was_valid_ = false;
     std::uint32_t rose_ = 0;

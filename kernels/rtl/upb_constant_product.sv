@@ -7,8 +7,8 @@ module upb_constant_product #(
     parameter integer OUT = 32,
     parameter signed [31:0] FACTOR = 1
 ) (
-    input  wire signed [ IN-1:0] x,
-    output wire signed [OUT-1:0] product
+    input  wire [ IN-1:0] x,         // signed, as is product
+    output wire [OUT-1:0] product
 );
     // The canonical form of f has +1 at digit n where bit n + 1 is set in 3 f and not in f, -1 the other way round.
     localparam signed [34:0] WIDE = FACTOR;
@@ -41,7 +41,7 @@ module upb_constant_product #(
     localparam integer ADDED = ones(PLUS);
     localparam integer TAKEN = ones(MINUS);
 
-    wire signed [OUT-1:0] wide = {{(OUT > IN ? OUT - IN : 1){x[IN-1]}}, x};
+    wire [OUT-1:0] wide = {{(OUT > IN ? OUT - IN : 1) {x[IN-1]}}, x};
     wire [OUT-1:0] plus, minus;
     generate
         if (ADDED == 0) begin : no_plus
@@ -49,8 +49,8 @@ module upb_constant_product #(
         end else begin : some_plus
             wire [OUT-1:0] up_to[0:ADDED-1];
             for (genvar n = 0; n < ADDED; n = n + 1) begin : digit
-                if (n == 0) assign up_to[n] = wide <<< place(PLUS, n);
-                else assign up_to[n] = up_to[n-1] + (wide <<< place(PLUS, n));
+                if (n == 0) assign up_to[n] = wide << place(PLUS, n);
+                else assign up_to[n] = up_to[n-1] + (wide << place(PLUS, n));
             end
             assign plus = up_to[ADDED-1];
         end
@@ -59,8 +59,8 @@ module upb_constant_product #(
         end else begin : some_minus
             wire [OUT-1:0] up_to[0:TAKEN-1];
             for (genvar n = 0; n < TAKEN; n = n + 1) begin : digit
-                if (n == 0) assign up_to[n] = wide <<< place(MINUS, n);
-                else assign up_to[n] = up_to[n-1] + (wide <<< place(MINUS, n));
+                if (n == 0) assign up_to[n] = wide << place(MINUS, n);
+                else assign up_to[n] = up_to[n-1] + (wide << place(MINUS, n));
             end
             assign minus = up_to[TAKEN-1];
         end

@@ -1,3 +1,4 @@
+`include "upb_check.svh"
 // upb_core: 32-beam columns in, 64-row columns out, to the bit of the integer contract (docs/numeric-contract.md).
 //
 //   s_axis -> skid -> receiver -> columns -> fill -> minimum -> block code -> networks -> output -> FIFO -> m_axis
@@ -42,32 +43,23 @@ module upb_core #(
     output wire        ev_overrun         // the FIFO lost a beat: never, by construction
 );
     localparam integer HIDDEN = upb_pkg::UPB_HIDDEN;
-    localparam integer INTERVAL = FOLD / LANES;  // clocks between slots
+    localparam integer INTERVAL = FOLD / (LANES < 1 ? 1 : LANES);  // clocks between slots
     localparam integer UNITS = FOLD <= HIDDEN ? (HIDDEN + FOLD - 1) / FOLD : 1;
     localparam integer PHASES = FOLD <= HIDDEN ? 1 : FOLD / HIDDEN;
     localparam integer RECTIFY = upb_pkg::UPB_DISTANCE_SLOPE > 0 || upb_pkg::UPB_INTENSITY_SLOPE > 0 ? 2 : 1;
     localparam integer BEHIND = (RECTIFY + 5 + PHASES - 1) / PHASES;
 
-    generate
-        if (LANES < 1 || FOLD < 1 || FOLD % LANES != 0) begin : bad_lanes
-            $error("upb_core: LANES must divide FOLD, both at least 1");
-        end
-        if (FOLD > HIDDEN && FOLD != 2 * HIDDEN && FOLD != 4 * HIDDEN && FOLD != 8 * HIDDEN) begin : bad_fold
-            $error("upb_core: FOLD must be at most the hidden units, or 2, 4 or 8 times them");
-        end
-        if (FOLD != upb_pkg::UPB_FOLD) begin : other_fold
-            $error("upb_core: FOLD is not the one that upb_config.svh was generated for");
-        end
-        if (HIDDEN < 1 || HIDDEN > 32) begin : bad_hidden
-            $error("upb_core: hidden units must be 1 to 32");
-        end
-        if (upb_pkg::UPB_WEIGHT_BITS != (upb_pkg::UPB_BLOCK_CODE != 0 ? 8 : 16)) begin : bad_precision
-            $error("upb_core: weights must have 8 bits with the block code (int8) and 16 without (int16)");
-        end
-        if (upb_pkg::UPB_CONFIG_CRC32 != upb_pkg::UPB_MODEL_CRC32) begin : other_model
-            $error("upb_core: upb_config.svh and upb_params.svh are of different models");
-        end
-    endgenerate
+    `UPB_REQUIRE(HIDDEN >= 1 && HIDDEN <= 32, bad_hidden, "upb_core: hidden units must be 1 to 32")
+    `UPB_REQUIRE(FOLD >= 1 && (FOLD <= HIDDEN || FOLD == 2 * HIDDEN || FOLD == 4 * HIDDEN || FOLD == 8 * HIDDEN),
+                 bad_fold, "upb_core: FOLD must be at most the hidden units, or 2, 4 or 8 times them")
+    `UPB_REQUIRE(LANES >= 1 && FOLD % (LANES < 1 ? 1 : LANES) == 0, bad_lanes,
+                 "upb_core: LANES must divide FOLD, both at least 1")
+    `UPB_REQUIRE(FOLD == upb_pkg::UPB_FOLD, other_fold,
+                 "upb_core: FOLD is not the one that upb_config.svh was generated for")
+    `UPB_REQUIRE(upb_pkg::UPB_WEIGHT_BITS == (upb_pkg::UPB_BLOCK_CODE != 0 ? 8 : 16), bad_precision,
+                 "upb_core: weights must have 8 bits with the block code (int8) and 16 without (int16)")
+    `UPB_REQUIRE(upb_pkg::UPB_CONFIG_CRC32 == upb_pkg::UPB_MODEL_CRC32, other_model,
+                 "upb_core: upb_config.svh and upb_params.svh are of different models")
 
     // ------------------------------------------------------------------ times, in clocks after the slot
     localparam integer NETWORK = PHASES == 1

@@ -1,3 +1,4 @@
+`include "upb_check.svh"
 // upb_fifo: synchronous FIFO of DEPTH (a power of two) entries and a registered output (valid/ready).
 // The writer never waits: it keeps SLACK entries free by looking at `room`, which is registered and is high while at most
 // DEPTH - SLACK entries are taken (or on their way). `overrun` is a pulse that a writer who counts right never sees; the entry is then lost.
@@ -19,14 +20,8 @@ module upb_fifo #(
 );
     localparam integer BITS = $clog2(DEPTH);
 
-    generate
-        if (DEPTH < 2 || (DEPTH & (DEPTH - 1)) != 0) begin : bad_depth
-            $error("upb_fifo: DEPTH must be a power of two");
-        end
-        if (SLACK >= DEPTH) begin : bad_slack
-            $error("upb_fifo: SLACK must be less than DEPTH");
-        end
-    endgenerate
+    `UPB_REQUIRE(DEPTH >= 2 && (DEPTH & (DEPTH - 1)) == 0, bad_depth, "upb_fifo: DEPTH must be a power of two")
+    `UPB_REQUIRE(SLACK < DEPTH, bad_slack, "upb_fifo: SLACK must be less than DEPTH")
 
     reg [WIDTH-1:0] memory[0:DEPTH-1];
     reg [BITS:0] written;

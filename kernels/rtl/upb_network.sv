@@ -70,7 +70,7 @@ module upb_network #(
                 upb_network_serial #(
                     .XBITS(XBITS), .WBITS(WBITS), .HIDDEN(HIDDEN), .PHASES(PHASES), .BEHIND(BEHIND), .K(K), .J(J),
                     .SLOPE(SLOPE), .RECTIFY(RECTIFY), .C(C), .X(W), .B(B)
-                ) unit (.clk(clk), .load(load), .e(e_in), .m(m_in), .total(totals[l*32 +: 32]));
+                ) unit (.clk(clk), .rst(rst), .load(load), .e(e_in), .m(m_in), .total(totals[l*32 +: 32]));
             end
         end
         if (LANES == 1) begin : only

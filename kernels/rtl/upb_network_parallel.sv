@@ -61,10 +61,12 @@ module upb_network_parallel #(
             reg [BITS-1:0] step, v_step;
             wire [BITS-1:0] at = load ? {BITS{1'b0}} : step;
             wire [BITS-1:0] v_at = loaded[TO_V-1] ? {BITS{1'b0}} : v_step;
-            always @(posedge clk) begin
-                step <= at + 1'b1;
-                v_step <= v_at + 1'b1;
-            end
+            always @(posedge clk)
+                if (rst) {v_step, step} <= {(2 * BITS) {1'b0}};
+                else begin
+                    step <= at == FOLD - 1 ? {BITS{1'b0}} : at + 1'b1;
+                    v_step <= v_at == FOLD - 1 ? {BITS{1'b0}} : v_at + 1'b1;
+                end
             upb_rom #(.WIDTH(UNITS * 6 * WBITS), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(W)) rom_w (
                 .clk(clk), .address(at), .q(w_now)
             );
@@ -146,7 +148,7 @@ module upb_network_parallel #(
             if (FOLD == 1) begin : baked_v
                 localparam signed [WBITS-1:0] WEIGHT = V[u*WBITS +: WBITS];
                 upb_constant_product #(.IN(16), .OUT(16 + WBITS), .FACTOR(WEIGHT)) product (
-                    .x($signed(z)), .product(pv)
+                    .x(z), .product(pv)
                 );
             end else begin : multiplied_v
                 assign pv = $signed(z) * $signed(v_now[u*WBITS +: WBITS]);

@@ -1,3 +1,4 @@
+`include "upb_check.svh"
 // upb_network_serial: steps 4 to 7 of the contract (see upb_network_parallel) with 8 / PHASES multipliers, PHASES clocks a hidden unit.
 //
 // A unit takes eight products: W[0..5] * e, M * m and V * z. Product p is at multiplier p % MULTIPLIERS in phase p / MULTIPLIERS. z of a unit is
@@ -21,6 +22,7 @@ module upb_network_serial #(
     parameter [HIDDEN*32-1:0] B = 0
 ) (
     input  wire               clk,
+    input  wire               rst,
     input  wire               load,
     input  wire [6*XBITS-1:0] e,
     input  wire [  XBITS-1:0] m,
@@ -35,19 +37,17 @@ module upb_network_serial #(
     localparam integer V_PHASE = PHASES - 1, V_AT = MULTIPLIERS - 1;
     localparam integer PB = 16 + WORD;
 
-    generate
-        if (PHASES != 2 && PHASES != 4 && PHASES != 8) begin : bad_phases
-            $error("upb_network_serial: PHASES must be 2, 4 or 8");
-        end
-        if (BEHIND * PHASES < RECTIFY + 5 || BEHIND * PHASES >= RECTIFY + 5 + PHASES) begin : bad_behind
-            $error("upb_network_serial: BEHIND does not meet the clock at which z is ready");
-        end
-    endgenerate
+    `UPB_REQUIRE(PHASES == 2 || PHASES == 4 || PHASES == 8, bad_phases,
+                 "upb_network_serial: PHASES must be 2, 4 or 8")
+    `UPB_REQUIRE(BEHIND * PHASES >= RECTIFY + 5 && BEHIND * PHASES < RECTIFY + 5 + PHASES, bad_behind,
+                 "upb_network_serial: BEHIND does not meet the clock at which z is ready")
 
     // ------------------------------------------------------------------ clock 0: which step
     reg [BITS-1:0] step;
     wire [BITS-1:0] at = load ? {BITS{1'b0}} : step;
-    always @(posedge clk) step <= at + 1'b1;
+    always @(posedge clk)
+        if (rst) step <= {BITS{1'b0}};
+        else step <= at == FOLD - 1 ? {BITS{1'b0}} : at + 1'b1;
 
     // The phase, and whether this is unit 0 (and the unit whose V slot is unit 0's), travel along.
     wire [PHASE_BITS-1:0] phase0 = at[PHASE_BITS-1:0];

@@ -7,6 +7,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from upbeam.hw_sim.fpga import ToolError
+from upbeam.hw_sim.fpga.backend import rtl_backend
 from upbeam.kernels.opencl import OpenClError
 from upbeam.model.frames import Frame
 from upbeam.quant.verify import (
@@ -105,7 +107,7 @@ def _given(frame: Frame, model: Model) -> Any:
 def _verify(
     model: Model, precision: str, sets: Sequence[VectorSet], notes: list[str], *, quiet: bool
 ) -> dict[str, BackendResult]:
-    backends = [*cpu_backends(model, precision), *_opencl(model, precision, notes)]
+    backends = [*cpu_backends(model, precision), *_opencl(model, precision, notes), *_rtl(model, precision, notes)]
     if precision == "fp32":
         reference, *backends = backends
         first = BackendResult({vectors.name: None for vectors in sets})
@@ -122,6 +124,17 @@ def _opencl(model: Model, precision: str, notes: list[str]) -> list[Backend]:
         return opencl_backends(model, precision)
     except OpenClError as error:
         notes.append(f"{precision}: no OpenCL: {error}")
+        return []
+
+
+def _rtl(model: Model, precision: str, notes: list[str]) -> list[Backend]:
+    """The FPGA core, simulated: integers only."""
+    if precision == "fp32":
+        return []
+    try:
+        return [rtl_backend(model.data, model.name, precision)]
+    except ToolError as error:
+        notes.append(f"{precision}: no RTL simulation: {error}")
         return []
 
 

@@ -1,0 +1,108 @@
+"""Builds a simulator of the core, once for each configuration, and keeps it in the user's cache.
+
+Two independent front ends, so that a quirk of one cannot hide: Verilator, and Yosys (the one that synthesises), whose
+CXXRTL back end writes C++ as well. Both are driven by one harness.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Literal
+
+from .tools import Tool, compiler, find_verilator, find_yosys, run
+
+__all__ = ["CACHE_VARIABLE", "SIMULATORS", "Simulator", "build", "cache_folder", "sources"]
+
+Simulator = Literal["verilator", "cxxrtl"]
+SIMULATORS: tuple[Simulator, ...] = ("verilator", "cxxrtl")
+CACHE_VARIABLE = "UPBEAM_RTL_CACHE"
+"""Environment variable: where built simulators are kept, ``~/.cache/upbeam/rtl`` without it."""
+TOP = "upb_core"
+PACKAGE = "upb_pkg.sv"
+HARNESS = "harness.cpp"
+_RUNTIME = ("verilated.cpp", "verilated_threads.cpp")
+_TRACE = ("verilated_vcd_c.cpp",)
+
+
+def sources() -> dict[str, str]:
+    """The core's SystemVerilog files by name, the package first; and what they include."""
+    folder = resources.files("upbeam.kernels").joinpath("rtl")
+    found = {item.name: item.read_text() for item in folder.iterdir() if item.name.endswith((".sv", ".svh"))}
+    return {name: found[name] for name in sorted(found, key=lambda name: (name != PACKAGE, name))}
+
+
+def cache_folder() -> Path:
+    given = os.environ.get(CACHE_VARIABLE)
+    if given:
+        return Path(given)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "upbeam" / "rtl"
+
+
+def build(headers: Mapping[str, str], simulator: Simulator = "verilator", *, trace: bool = False) -> Path:
+    """The simulator of a configuration (``quant.export.rtl.core_headers``), from the cache or built (seconds).
+
+    ``trace``: it can write a VCD, and is slower (Verilator only). Raises ToolError."""
+    if trace and simulator != "verilator":
+        raise ValueError("only Verilator writes a VCD here")
+    tool = find_verilator() if simulator == "verilator" else find_yosys()
+    harness = resources.files("upbeam.hw_sim").joinpath("fpga", HARNESS).read_text()
+    files = {**sources(), **headers, HARNESS: harness}
+    key = repr((sorted(files.items()), simulator, trace, tool.version(), compiler()))
+    kept = cache_folder() / hashlib.sha256(key.encode()).hexdigest()[:32]
+    if not kept.is_file():
+        maker = _with_verilator if simulator == "verilator" else _with_yosys
+        _keep(kept, lambda folder: maker(folder, tool, files, trace), files)
+    return kept
+
+
+def _keep(kept: Path, make: Callable[[Path], Path], files: Mapping[str, str]) -> None:
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="upbeam-rtl-") as scratch:
+        for name, text in files.items():
+            (Path(scratch) / name).write_text(text)
+        made = make(Path(scratch))
+        # Renamed into place: whoever builds the same at the same time finds a whole file.
+        partial = kept.with_name(f"{kept.name}.{os.getpid()}")
+        shutil.copy2(made, partial)
+        partial.replace(kept)
+
+
+def _units(files: Mapping[str, str]) -> list[str]:
+    return [name for name in files if name.endswith(".sv")]
+
+
+def _with_verilator(folder: Path, tool: Tool, files: Mapping[str, str], trace: bool) -> Path:
+    assert tool.root is not None
+    # Widths are chosen on purpose (sums modulo 2^32); every other warning stops the build.
+    flags = ["--cc", "-O3", "--x-assign", "unique", "--x-initial", "unique", "-Wno-WIDTH", "--assert"]
+    flags += ["--trace"] if trace else []
+    command = [*tool.command, *flags, "--top-module", TOP, "--Mdir", "made", "-I.", *_units(files)]
+    run(command, folder, tool.name, tool.environment())
+    include = tool.root / "include"
+    runtime = [str(include / name) for name in (*_RUNTIME, *(_TRACE if trace else ()))]
+    made = [str(path) for path in sorted((folder / "made").glob("*.cpp"))]
+    defines = [f"-DVM_TRACE={int(trace)}", f"-DVM_TRACE_VCD={int(trace)}", "-DVM_COVERAGE=0", "-DVM_SC=0"]
+    return _compile(folder, [*defines, f"-I{include}", f"-I{include / 'vltstd'}", "-Imade", *made, *runtime])
+
+
+def _with_yosys(folder: Path, tool: Tool, files: Mapping[str, str], trace: bool) -> Path:
+    assert tool.root is not None and not trace
+    script = (
+        f"read_verilog -sv -I. {' '.join(_units(files))}; hierarchy -check -top {TOP}; proc; flatten; "
+        "write_cxxrtl -O6 -g0 upb_core_cxxrtl.cpp"
+    )
+    run([*tool.command, "-q", "-p", script], folder, tool.name, tool.environment())
+    return _compile(folder, ["-DUPB_CXXRTL", f"-I{tool.root / 'include' / 'backends' / 'cxxrtl' / 'runtime'}"])
+
+
+def _compile(folder: Path, options: list[str]) -> Path:
+    command = [*compiler(), "-O2", "-std=c++17", "-pthread", *options, HARNESS, "-o", "simulator"]
+    run(command, folder, "the C++ compiler")
+    return folder / "simulator"
