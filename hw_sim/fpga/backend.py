@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from upbeam.quant.export.source import Source
-from upbeam.quant.integer import CONTRACTS, Precision
+from upbeam.quant.integer import CONTRACTS
 from upbeam.quant.verify import Backend, Image
 
 from .beats import U8, U16, image_beats
@@ -43,4 +42,4 @@ def rtl_backend(data: bytes, name: str, precision: str) -> Backend:
 def _core(data: bytes, name: str, precision: str) -> RtlCore:
     if precision not in CONTRACTS:
         raise ValueError(f"the RTL core computes in {' and '.join(CONTRACTS)}, not in {precision}")
-    return RtlCore(Source.of(data, name), cast(Precision, precision))
+    return RtlCore(Source.of(data, name), precision)

@@ -11,7 +11,10 @@ from upbeam.model.rules import BEAMS, ROWS
 
 __all__ = ["ENDS", "LAST", "STARTS", "OutputColumns", "column_beats", "image_beats", "output_columns"]
 
-U8, U16, U32, U64 = NDArray[np.uint8], NDArray[np.uint16], NDArray[np.uint32], NDArray[np.uint64]
+U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+U32 = NDArray[np.uint32]
+U64 = NDArray[np.uint64]
 
 LAST = np.uint32(1 << 24)
 """tlast: beam 31."""
@@ -23,7 +26,7 @@ ENDS = np.uint32(1 << 26)
 
 def column_beats(distance: U16, intensity: U8) -> U32:
     """Columns ``[32, N]`` -> beats ``[N, 32]`` without frame marks."""
-    words = distance.T.astype(np.uint32) | intensity.T.astype(np.uint32) << np.uint32(16)
+    words: U32 = distance.T.astype(np.uint32) | intensity.T.astype(np.uint32) << np.uint32(16)
     words[:, BEAMS - 1] |= LAST
     return words
 

@@ -22,6 +22,7 @@ EVENTS = (
     "columns", "frames", "short_columns", "long_columns", "short_frames", "long_frames", "dropped_beats", "overruns",
 )  # fmt: skip
 _MAGIC = 0x31425055
+_FOREVER = 1 << 62
 _FAILURES = {
     1: "m_axis_tvalid fell before m_axis_tready",
     2: "m_axis data changed before m_axis_tready",
@@ -48,8 +49,8 @@ class Traffic:
     """share of the clocks at which the source offers nothing new"""
     stall: float = 0.0
     """share of the clocks at which the sink is not ready"""
-    stuck: tuple[int, int] = (0, 0)
-    """clocks from, until: the sink takes nothing at all"""
+    stuck: tuple[int, int | None] = (0, 0)
+    """clocks from, until (None: for ever): the sink takes nothing at all"""
     seed: int = 1
 
 
@@ -99,7 +100,13 @@ class RtlCore:
         self.trace = trace
 
     def run(
-        self, beats: U32, columns: int, traffic: Traffic | None = None, *, vcd: Path | None = None, timeout_s: float = 600
+        self,
+        beats: U32,
+        columns: int,
+        traffic: Traffic | None = None,
+        *,
+        vcd: Path | None = None,
+        timeout_s: float = 600,
     ) -> Run:
         """``beats``: see ``beats.py``; ``columns`` of a frame. Raises SimulationError where the core breaks a rule of
         AXI4-Stream or the simulator fails."""
@@ -107,14 +114,23 @@ class RtlCore:
             raise ValueError("this simulator was built without trace")
         t = traffic or Traffic()
         options = {
-            "columns": columns, "seed": t.seed, "gap": round(t.gap * 65536), "stall": round(t.stall * 65536),
-            "stuck-from": t.stuck[0], "stuck-until": t.stuck[1], "quiet": 80 * self.configuration.interval + 500,
-        }  # fmt: skip
+            "columns": columns,
+            "seed": t.seed,
+            "gap": round(t.gap * 65536),
+            "stall": round(t.stall * 65536),
+            "stuck-from": t.stuck[0],
+            "stuck-until": _FOREVER if t.stuck[1] is None else t.stuck[1],
+            "quiet": 80 * self.configuration.interval + 500,
+        }
         command = [str(self.program), *(text for key, value in options.items() for text in (f"--{key}", str(value)))]
         if vcd is not None:
             command += ["--vcd", str(vcd)]
         done = subprocess.run(
-            command, input=np.ascontiguousarray(beats, "<u4").tobytes(), capture_output=True, timeout=timeout_s, check=False
+            command,
+            input=np.ascontiguousarray(beats, "<u4").tobytes(),
+            capture_output=True,
+            timeout=timeout_s,
+            check=False,
         )
         if done.returncode:
             raise SimulationError(f"the simulator ended with status {done.returncode}: {done.stderr.decode()}".rstrip())

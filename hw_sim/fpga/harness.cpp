@@ -1,11 +1,11 @@
-// Drives upb_core clock by clock, under Verilator or (UPB_CXXRTL) as the C++ that Yosys writes: beats from standard input, what
-// came of them to standard output.
+// Drives upb_core clock by clock, under Verilator or (UPB_CXXRTL) as the C++ that Yosys writes: beats from standard
+// input, what came of them to standard output.
 //
 // Input:  little-endian uint32 a beat: bits 0..23 tdata, 24 tlast, 25..26 tuser.
 // Output: a Head, then the clock at which each input beat was accepted (uint32), then 16 bytes for each output beat:
 //         uint64 with bits 0..47 tdata, 48 tlast, 49..50 tuser; uint32 its clock; uint32 the clock its valid rose.
-// Clock 0 is the first after reset. Gaps of the source and stalls of the sink are drawn from a seed; both keep the rules of AXI4-Stream,
-// and the core is held to them: what it offers stays until it is taken.
+// Clock 0 is the first after reset. Gaps of the source and stalls of the sink are drawn from a seed; both keep the
+// rules of AXI4-Stream, and the core is held to them: what it offers stays until it is taken.
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
@@ -26,7 +26,8 @@
 namespace {
 
 constexpr int kResetClocks = 64;
-constexpr std::uint32_t kMagic = 0x31425055;  // "UPB1"
+constexpr std::uint64_t kForever = 1ull << 62;
+constexpr std::uint32_t kMagic = 0x31425055; // "UPB1"
 
 struct Options {
     std::uint64_t columns = 2048, seed = 1, quiet = 4000, max_clocks = 1000000000;
@@ -36,10 +37,11 @@ struct Options {
 };
 
 struct Head {
-    std::uint32_t magic, failed;  // failed: 1 valid fell before ready, 2 data changed before ready, 3 too many clocks
+    std::uint32_t magic, failed; // failed: 1 valid fell before ready, 2 data changed before ready, 3 too many clocks
     std::uint64_t accepted, given, clocks;
-    std::uint64_t gaps, stalls;   // clocks without an offer before the last beat; clocks of a sink that was not ready, before its last
-    std::uint64_t events[8];      // columns, frames, short column, long column, short frame, long frame, dropped, overrun
+    std::uint64_t gaps,
+        stalls; // clocks without an offer before the last beat; clocks of a sink that was not ready, before its last
+    std::uint64_t events[8]; // columns, frames, short column, long column, short frame, long frame, dropped, overrun
 };
 
 struct Given {
@@ -53,7 +55,7 @@ class Random {
     bool once_in(std::uint64_t share) { return (next() & 0xFFFF) < share; }
 
   private:
-    std::uint64_t next() {  // xorshift64*
+    std::uint64_t next() { // xorshift64*
         state_ ^= state_ >> 12;
         state_ ^= state_ << 25;
         state_ ^= state_ >> 27;
@@ -66,7 +68,8 @@ class Random {
 // Ports as plain values around the model that Yosys wrote.
 class Core {
   public:
-    std::uint32_t aclk = 0, aresetn = 0, cfg_columns = 0, s_axis_tvalid = 0, s_axis_tdata = 0, s_axis_tlast = 0, s_axis_tuser = 0;
+    std::uint32_t aclk = 0, aresetn = 0, cfg_columns = 0, s_axis_tvalid = 0, s_axis_tdata = 0, s_axis_tlast = 0,
+                  s_axis_tuser = 0;
     std::uint32_t m_axis_tready = 0, s_axis_tready = 0, m_axis_tvalid = 0, m_axis_tlast = 0, m_axis_tuser = 0;
     std::uint64_t m_axis_tdata = 0;
     std::uint32_t ev_column = 0, ev_frame = 0, ev_short_column = 0, ev_long_column = 0;
@@ -103,7 +106,9 @@ class Core {
         return port.data[0] | (N > 32 ? static_cast<std::uint64_t>(port.data[N > 32 ? 1 : 0]) << 32 : 0);
     }
     template <std::size_t N> static std::uint64_t wide(const cxxrtl::wire<N> &port) { return wide(port.curr); }
-    template <class Port> static std::uint32_t value(const Port &port) { return static_cast<std::uint32_t>(wide(port)); }
+    template <class Port> static std::uint32_t value(const Port &port) {
+        return static_cast<std::uint32_t>(wide(port));
+    }
     cxxrtl_design::p_upb__core top_;
 };
 #else
@@ -127,14 +132,17 @@ class Bench {
         reset();
         std::uint64_t idle = 0;
         while (idle < options_.quiet) {
-            if (clock_ >= options_.max_clocks) head_.failed = 3;
-            if (head_.failed) break;
-            idle = step() || next_ < beats_.size() ? 0 : idle + 1;
-            // A source that is never served again ends too.
-            if (next_ < beats_.size() && clock_ > last_moved_ + options_.quiet + options_.stuck_until) break;
+            if (clock_ >= options_.max_clocks)
+                head_.failed = 3;
+            if (head_.failed)
+                break;
+            // A sink that is stuck for good ends the run, one that will take again does not.
+            const bool waits = clock_ < options_.stuck_until && options_.stuck_until < kForever;
+            idle = step() || waits ? 0 : idle + 1;
         }
 #if VM_TRACE
-        if (options_.vcd) trace_.close();
+        if (options_.vcd)
+            trace_.close();
 #endif
         return write();
     }
@@ -144,7 +152,8 @@ class Bench {
         core_.aclk = level != 0;
         core_.eval();
 #if VM_TRACE
-        if (options_.vcd) trace_.dump(time_);
+        if (options_.vcd)
+            trace_.dump(time_);
 #endif
         time_++;
     }
@@ -169,8 +178,10 @@ class Bench {
         const bool in = core_.s_axis_tvalid && core_.s_axis_tready;
         const bool out = core_.m_axis_tvalid && core_.m_axis_tready;
         check();
-        if (in) accepted_.push_back(static_cast<std::uint32_t>(clock_));
-        if (out) given_.push_back({beat(), static_cast<std::uint32_t>(clock_), rose_});
+        if (in)
+            accepted_.push_back(static_cast<std::uint32_t>(clock_));
+        if (out)
+            given_.push_back({beat(), static_cast<std::uint32_t>(clock_), rose_});
         count();
         tally(out);
         was_valid_ = core_.m_axis_tvalid && !out;
@@ -180,13 +191,13 @@ class Bench {
             next_++;
             offering_ = false;
         }
-        if (in || out) last_moved_ = clock_;
         clock_++;
         return in || out;
     }
 
     void offer() {
-        if (!offering_ && next_ < beats_.size()) offering_ = !random_.once_in(options_.gap);
+        if (!offering_ && next_ < beats_.size())
+            offering_ = !random_.once_in(options_.gap);
         core_.s_axis_tvalid = offering_;
         if (offering_) {
             const std::uint32_t word = beats_[next_];
@@ -204,9 +215,12 @@ class Bench {
     }
 
     void check() {
-        if (was_valid_ && !core_.m_axis_tvalid) head_.failed = 1;
-        if (was_valid_ && beat() != was_beat_) head_.failed = 2;
-        if (core_.m_axis_tvalid && !was_valid_) rose_ = static_cast<std::uint32_t>(clock_);
+        if (was_valid_ && !core_.m_axis_tvalid)
+            head_.failed = 1;
+        if (was_valid_ && beat() != was_beat_)
+            head_.failed = 2;
+        if (core_.m_axis_tvalid && !was_valid_)
+            rose_ = static_cast<std::uint32_t>(clock_);
     }
 
     // Stalls after the last output beat delay nothing: they count once another beat is taken.
@@ -220,9 +234,11 @@ class Bench {
     }
 
     void count() {
-        const std::uint64_t now[8] = {core_.ev_column,      core_.ev_frame,      core_.ev_short_column, core_.ev_long_column,
-                              core_.ev_short_frame, core_.ev_long_frame, core_.ev_dropped,      core_.ev_overrun};
-        for (int n = 0; n < 8; n++) head_.events[n] += now[n];
+        const std::uint64_t now[8] = {core_.ev_column,      core_.ev_frame,       core_.ev_short_column,
+                                      core_.ev_long_column, core_.ev_short_frame, core_.ev_long_frame,
+                                      core_.ev_dropped,     core_.ev_overrun};
+        for (int n = 0; n < 8; n++)
+            head_.events[n] += now[n];
     }
 
     int write() {
@@ -230,9 +246,10 @@ class Bench {
         head_.accepted = accepted_.size();
         head_.given = given_.size();
         head_.clocks = clock_;
-        const bool done = std::fwrite(&head_, sizeof head_, 1, stdout) == 1 &&
-                          std::fwrite(accepted_.data(), sizeof accepted_[0], accepted_.size(), stdout) == accepted_.size() &&
-                          std::fwrite(given_.data(), sizeof given_[0], given_.size(), stdout) == given_.size();
+        const bool done =
+            std::fwrite(&head_, sizeof head_, 1, stdout) == 1 &&
+            std::fwrite(accepted_.data(), sizeof accepted_[0], accepted_.size(), stdout) == accepted_.size() &&
+            std::fwrite(given_.data(), sizeof given_[0], given_.size(), stdout) == given_.size();
         return done && std::fflush(stdout) == 0 ? 0 : 2;
     }
 
@@ -243,7 +260,7 @@ class Bench {
     VerilatedVcdC trace_;
 #endif
     Core core_;
-    std::uint64_t clock_ = 0, time_ = 0, last_moved_ = 0, was_beat_ = 0, pending_stalls_ = 0;
+    std::uint64_t clock_ = 0, time_ = 0, was_beat_ = 0, pending_stalls_ = 0;
     std::size_t next_ = 0;
     bool offering_ = false, was_valid_ = false;
     std::uint32_t rose_ = 0;
@@ -257,20 +274,26 @@ bool parse(int argc, char **argv, Options &options) {
         const char *name;
         std::uint64_t *value;
     } const numbers[] = {
-        {"--columns", &options.columns},       {"--seed", &options.seed},
-        {"--quiet", &options.quiet},           {"--max-clocks", &options.max_clocks},
-        {"--gap", &options.gap},               {"--stall", &options.stall},
-        {"--stuck-from", &options.stuck_from}, {"--stuck-until", &options.stuck_until},
+        {"--columns", &options.columns},
+        {"--seed", &options.seed},
+        {"--quiet", &options.quiet},
+        {"--max-clocks", &options.max_clocks},
+        {"--gap", &options.gap},
+        {"--stall", &options.stall},
+        {"--stuck-from", &options.stuck_from},
+        {"--stuck-until", &options.stuck_until},
     };
     for (int n = 1; n + 1 < argc; n += 2) {
         bool known = std::strcmp(argv[n], "--vcd") == 0;
-        if (known) options.vcd = argv[n + 1];
+        if (known)
+            options.vcd = argv[n + 1];
         for (const auto &number : numbers)
             if (std::strcmp(argv[n], number.name) == 0) {
                 *number.value = std::strtoull(argv[n + 1], nullptr, 10);
                 known = true;
             }
-        if (!known) return false;
+        if (!known)
+            return false;
     }
     return argc % 2 == 1;
 }
@@ -278,11 +301,12 @@ bool parse(int argc, char **argv, Options &options) {
 std::vector<std::uint32_t> read_beats() {
     std::vector<std::uint32_t> beats;
     std::uint32_t buffer[4096];
-    while (const std::size_t got = std::fread(buffer, sizeof buffer[0], 4096, stdin)) beats.insert(beats.end(), buffer, buffer + got);
+    while (const std::size_t got = std::fread(buffer, sizeof buffer[0], 4096, stdin))
+        beats.insert(beats.end(), buffer, buffer + got);
     return beats;
 }
 
-}  // namespace
+} // namespace
 
 int main(int argc, char **argv) {
     Options options;

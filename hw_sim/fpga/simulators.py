@@ -10,7 +10,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Literal
@@ -28,6 +28,7 @@ PACKAGE = "upb_pkg.sv"
 HARNESS = "harness.cpp"
 _RUNTIME = ("verilated.cpp", "verilated_threads.cpp")
 _TRACE = ("verilated_vcd_c.cpp",)
+_CXX = ("-O2", "-std=c++17", "-pthread")
 
 
 def sources() -> dict[str, str]:
@@ -52,17 +53,18 @@ def build(headers: Mapping[str, str], simulator: Simulator = "verilator", *, tra
     if trace and simulator != "verilator":
         raise ValueError("only Verilator writes a VCD here")
     tool = find_verilator() if simulator == "verilator" else find_yosys()
-    harness = resources.files("upbeam.hw_sim").joinpath("fpga", HARNESS).read_text()
+    harness = resources.files("upbeam.hw_sim").joinpath("fpga").joinpath(HARNESS).read_text()
     files = {**sources(), **headers, HARNESS: harness}
-    key = repr((sorted(files.items()), simulator, trace, tool.version(), compiler()))
-    kept = cache_folder() / hashlib.sha256(key.encode()).hexdigest()[:32]
-    if not kept.is_file():
-        maker = _with_verilator if simulator == "verilator" else _with_yosys
-        _keep(kept, lambda folder: maker(folder, tool, files, trace), files)
-    return kept
+    maker = _with_verilator if simulator == "verilator" else _with_yosys
+    key = (sorted(files.items()), simulator, trace, tool.version(), compiler())
+    return _kept(key, lambda folder: maker(folder, tool, files, trace), files)
 
 
-def _keep(kept: Path, make: Callable[[Path], Path], files: Mapping[str, str]) -> None:
+def _kept(key: object, make: Callable[[Path], Path], files: Mapping[str, str]) -> Path:
+    """The file of this key in the cache; made in a scratch folder that holds ``files`` if it is not there."""
+    kept = cache_folder() / hashlib.sha256(repr(key).encode()).hexdigest()[:32]
+    if kept.is_file():
+        return kept
     kept.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="upbeam-rtl-") as scratch:
         for name, text in files.items():
@@ -72,6 +74,7 @@ def _keep(kept: Path, make: Callable[[Path], Path], files: Mapping[str, str]) ->
         partial = kept.with_name(f"{kept.name}.{os.getpid()}")
         shutil.copy2(made, partial)
         partial.replace(kept)
+    return kept
 
 
 def _units(files: Mapping[str, str]) -> list[str]:
@@ -85,15 +88,35 @@ def _with_verilator(folder: Path, tool: Tool, files: Mapping[str, str], trace: b
     flags += ["--trace"] if trace else []
     command = [*tool.command, *flags, "--top-module", TOP, "--Mdir", "made", "-I.", *_units(files)]
     run(command, folder, tool.name, tool.environment())
-    include = tool.root / "include"
-    runtime = [str(include / name) for name in (*_RUNTIME, *(_TRACE if trace else ()))]
+    options = [*_verilated_options(tool, trace), "-Imade"]
     made = [str(path) for path in sorted((folder / "made").glob("*.cpp"))]
+    runtime = [str(_verilated_object(tool, trace, name)) for name in (*_RUNTIME, *(_TRACE if trace else ()))]
+    return _compile(folder, [*options, *made], runtime)
+
+
+def _verilated_options(tool: Tool, trace: bool) -> list[str]:
+    assert tool.root is not None
+    include = tool.root / "include"
     defines = [f"-DVM_TRACE={int(trace)}", f"-DVM_TRACE_VCD={int(trace)}", "-DVM_COVERAGE=0", "-DVM_SC=0"]
-    return _compile(folder, [*defines, f"-I{include}", f"-I{include / 'vltstd'}", "-Imade", *made, *runtime])
+    return [*defines, f"-I{include}", f"-I{include / 'vltstd'}"]
+
+
+def _verilated_object(tool: Tool, trace: bool, name: str) -> Path:
+    """Verilator's runtime is the same for every core, and takes longer to compile than most."""
+    assert tool.root is not None
+    source = str(tool.root / "include" / name)
+
+    def make(folder: Path) -> Path:
+        options = [*compiler(), *_CXX, *_verilated_options(tool, trace), "-c", source, "-o", "runtime.o"]
+        run(options, folder, "the C++ compiler")
+        return folder / "runtime.o"
+
+    return _kept(("runtime", name, trace, tool.version(), compiler()), make, {})
 
 
 def _with_yosys(folder: Path, tool: Tool, files: Mapping[str, str], trace: bool) -> Path:
-    assert tool.root is not None and not trace
+    assert tool.root is not None
+    assert not trace
     script = (
         f"read_verilog -sv -I. {' '.join(_units(files))}; hierarchy -check -top {TOP}; proc; flatten; "
         "write_cxxrtl -O6 -g0 upb_core_cxxrtl.cpp"
@@ -102,7 +125,6 @@ def _with_yosys(folder: Path, tool: Tool, files: Mapping[str, str], trace: bool)
     return _compile(folder, ["-DUPB_CXXRTL", f"-I{tool.root / 'include' / 'backends' / 'cxxrtl' / 'runtime'}"])
 
 
-def _compile(folder: Path, options: list[str]) -> Path:
-    command = [*compiler(), "-O2", "-std=c++17", "-pthread", *options, HARNESS, "-o", "simulator"]
-    run(command, folder, "the C++ compiler")
+def _compile(folder: Path, options: list[str], objects: Sequence[str] = ()) -> Path:
+    run([*compiler(), *_CXX, *options, HARNESS, *objects, "-o", "simulator"], folder, "the C++ compiler")
     return folder / "simulator"

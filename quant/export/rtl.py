@@ -240,9 +240,9 @@ def configuration_header(source: Source, precision: Precision, c: Configuration)
     model = source.integer(precision)
     made = [words(n, precision, c, bits) for n, bits in zip(model, (COUNT_BITS, INTENSITY_BITS), strict=True)]
     lines = [
-        f"// LANES {c.lanes}, FOLD {c.fold} of the {model.contract} networks. Generated from the model file; do not edit.",
+        f"// LANES {c.lanes}, FOLD {c.fold}, {model.contract}. Generated from the model file; do not edit.",
         *(f"// {key}: {text}" for key, text in source.describe()[:1]),
-        f"// {c.multipliers} multipliers a network and lane (FOLD 1: shifts and adds); a window every {c.interval} clocks.",
+        f"// {c.multipliers} products a clock, network and lane; a window every {c.interval} clocks.",
         "// Weights in the order of the schedule: quant/export/rtl_schedule.py. Word 0 lowest.",
         f"localparam [31:0] UPB_CONFIG_CRC32 = 32'h{source.crc32:08x};",
         *(_integer(name, value) for name, value in (("LANES", c.lanes), ("FOLD", c.fold), ("HIDDEN", c.hidden))),

@@ -1,8 +1,8 @@
-"""When the RTL core multiplies what: the schedule of a hidden layer for ``FOLD`` clocks a window, checked, and the weights
-in its order.
+"""When the RTL core multiplies what: the schedule of ``FOLD`` clocks a window, checked, and the weights in its order.
 
-A window takes eight products for each hidden unit: six of W, one of M, one of V. Up to ``FOLD = hidden`` whole units run
-side by side (``units`` a clock); beyond, a unit takes 2, 4 or 8 clocks (``phases``) and its products share multipliers.
+A window takes eight products for each hidden unit: six of W, one of M, one of V. Up to ``FOLD = hidden`` whole units
+run side by side (``units`` a clock); beyond, a unit takes 2, 4 or 8 clocks (``phases``) and its products share
+multipliers.
 ``kernels/rtl/upb_network_*.sv`` execute exactly this; docs/fpga.md has the timing.
 """
 
@@ -215,7 +215,10 @@ def _factor(n: IntegerNetwork, p: Placed) -> int:
 def _padded(n: IntegerNetwork, hidden: int) -> IntegerNetwork:
     """With units that give 0: their output weight is 0."""
     more = hidden - n.hidden
-    parts = {name: np.pad(getattr(n, name), (0, more)) for name in ("minimum", "bias", "output")}
-    return replace(n, weight=np.pad(n.weight, ((0, more), (0, 0))), **parts)
-
-
+    return replace(
+        n,
+        weight=np.pad(n.weight, ((0, more), (0, 0))),
+        minimum=np.pad(n.minimum, (0, more)),
+        bias=np.pad(n.bias, (0, more)),
+        output=np.pad(n.output, (0, more)),
+    )
