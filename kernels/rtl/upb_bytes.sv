@@ -1,0 +1,81 @@
+// upb_bytes: upb_core behind two byte streams, for parts and boards with few pins.
+//
+// In:  three bytes a beat, distance low byte first, then intensity; in_last and in_user with the third.
+// Out: six bytes a beat: sensor distance low, high, intensity; generated distance low, high, intensity.
+//      out_last with the sixth byte of beat 31; out_user[0] with all bytes of the first beat of a frame, out_user[1] as in upb_core.
+// Both ready outputs depend on registers alone. Rate: a beat every 6 clocks or every FOLD / LANES clocks, whichever is more.
+module upb_bytes (
+    input  wire       clk,
+    input  wire       resetn,
+    input  wire [7:0] in_data,
+    input  wire       in_valid,
+    output wire       in_ready,
+    input  wire       in_last,
+    input  wire [1:0] in_user,
+    output wire [7:0] out_data,
+    output wire       out_valid,
+    input  wire       out_ready,
+    output wire       out_last,
+    output wire [1:0] out_user,
+    output reg        error          // since reset: something did not fit, or was lost
+);
+    // ------------------------------------------------------------------ three bytes to a beat
+    reg  [ 1:0] have;                // bytes at hand; 3: a beat is offered
+    reg  [23:0] word;
+    reg         word_last;
+    reg  [ 1:0] word_user;
+    reg         awake;
+    wire        beat_ready;
+    assign in_ready = awake && have != 2'd3;
+    always @(posedge clk) begin
+        awake <= resetn;
+        if (!resetn) have <= 2'd0;
+        else if (have == 2'd3) begin
+            if (beat_ready) have <= 2'd0;
+        end else if (in_valid && in_ready) begin
+            have <= have + 2'd1;
+            word <= {in_data, word[23:8]};
+            word_last <= in_last;
+            word_user <= in_user;
+        end
+    end
+
+    wire [47:0] beat;
+    wire beat_valid, beat_taken, beat_last;
+    wire [1:0] beat_user;
+    wire [7:0] events;
+    upb_core core (
+        .aclk(clk), .aresetn(resetn), .cfg_columns(upb_pkg::UPB_COLUMNS[15:0]),
+        .s_axis_tdata(word), .s_axis_tvalid(have == 2'd3), .s_axis_tready(beat_ready),
+        .s_axis_tlast(word_last), .s_axis_tuser(word_user),
+        .m_axis_tdata(beat), .m_axis_tvalid(beat_valid), .m_axis_tready(beat_taken),
+        .m_axis_tlast(beat_last), .m_axis_tuser(beat_user),
+        .ev_column(events[0]), .ev_frame(events[1]), .ev_short_column(events[2]), .ev_long_column(events[3]),
+        .ev_short_frame(events[4]), .ev_long_frame(events[5]), .ev_dropped(events[6]), .ev_overrun(events[7])
+    );
+    always @(posedge clk)
+        if (!resetn) error <= 1'b0;
+        else if (|events[7:2]) error <= 1'b1;
+
+    // ------------------------------------------------------------------ a beat to six bytes
+    reg [ 2:0] left;                 // bytes still to give
+    reg [47:0] rest;
+    reg        rest_last;
+    reg [ 1:0] rest_user;
+    assign beat_taken = left == 3'd0;
+    assign out_data = rest[7:0];
+    assign out_valid = left != 3'd0;
+    assign out_last = rest_last && left == 3'd1;
+    assign out_user = rest_user;
+    always @(posedge clk)
+        if (!resetn) left <= 3'd0;
+        else if (left == 3'd0) begin
+            if (beat_valid) left <= 3'd6;
+            rest <= beat;
+            rest_last <= beat_last;
+            rest_user <= beat_user;
+        end else if (out_ready) begin
+            left <= left - 3'd1;
+            rest <= {8'd0, rest[47:8]};
+        end
+endmodule
