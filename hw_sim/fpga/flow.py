@@ -17,6 +17,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -118,9 +119,9 @@ class _Folder:
         self._on_step(name, False)
         begun = time.monotonic()
         made = {"step": name, "key": wanted, **make(), "seconds": round(time.monotonic() - begun, 1)}
-        partial = file.with_suffix(".partial")
-        partial.write_text(json.dumps(made, indent=2) + "\n", encoding="utf-8")
-        partial.replace(file)
+        unfinished = file.with_suffix(".partial")
+        unfinished.write_text(json.dumps(made, indent=2) + "\n", encoding="utf-8")
+        unfinished.replace(file)
         return made
 
 
@@ -168,10 +169,13 @@ def run_flow(
         tool = find_wheel_tool(*part.router)
         aim = target_mhz or (200 if part.name.startswith("ecp5") else 60)
         for seed in seeds:
-            key = synthesised["key"], part, tool.version(), seed, aim
-            routes.append(made.step(f"route-{seed}", key, lambda s=seed: _route(folder, part, tool, s, aim)))  # type: ignore[misc]
-    key = synthesised["key"], [r["key"] for r in routes]
-    return made.step("report", key, lambda: _report(about, source, c.interval, synthesised, routes))
+            route_key = synthesised["key"], part, tool.version(), seed, aim
+            routes.append(made.step(f"route-{seed}", route_key, partial(_route, folder, part, tool, seed, aim)))
+    return made.step(
+        "report",
+        (synthesised["key"], [r["key"] for r in routes]),
+        lambda: _report(about, source, c.interval, synthesised, routes),
+    )
 
 
 def _generate(folder: Path, files: Mapping[str, str]) -> dict[str, Any]:

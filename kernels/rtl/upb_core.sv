@@ -85,11 +85,17 @@ module upb_core #(
     // ------------------------------------------------------------------ slots
     localparam integer SLOT_BITS = INTERVAL > 1 ? $clog2(INTERVAL) : 1;
     reg [SLOT_BITS-1:0] count;
-    wire slot = count == {SLOT_BITS{1'b0}} && !rst;
+    reg slot;  // high in reset too, where nothing listens
     wire [AT_WRITE:0] at;
+    wire turns = count == INTERVAL - 1;
     always @(posedge clk)
-        if (rst) count <= {SLOT_BITS{1'b0}};
-        else count <= count == INTERVAL - 1 ? {SLOT_BITS{1'b0}} : count + 1'b1;
+        if (rst) begin
+            count <= {SLOT_BITS{1'b0}};
+            slot <= 1'b1;
+        end else begin
+            count <= turns ? {SLOT_BITS{1'b0}} : count + 1'b1;
+            slot <= turns;
+        end
     upb_strobes #(.DEPTH(AT_WRITE)) times (.clk(clk), .rst(rst), .d(slot), .tap(at));
 
     // ------------------------------------------------------------------ columns

@@ -47,16 +47,23 @@ module upb_network_parallel #(
     wire [UNITS*16-1:0] m_now;
     wire [UNITS*32-1:0] b_now;
     wire [UNITS*WBITS-1:0] v_now;
-    wire [6*XBITS-1:0] e_now;
+    wire [6*XBITS-1:0] operands, e_now;
     wire [XBITS-1:0] m_in;
+    // 16 bits are given to a signed multiplier less 2^15; inverted here, before the register, so that none stands after it.
+    function automatic [XBITS-1:0] operand(input [XBITS-1:0] x);
+        operand = {x[XBITS-1] ^ (XBITS == 16), x[XBITS-2:0]};
+    endfunction
     generate
+        for (genvar i = 0; i < 6; i = i + 1) begin : given
+            assign operands[i*XBITS +: XBITS] = operand(e[i*XBITS +: XBITS]);
+        end
         if (FOLD == 1) begin : constant
             assign w_now = W;
             assign m_now = M;
             assign b_now = B;
             assign v_now = V;
-            assign e_now = e;
-            assign m_in = m;
+            assign e_now = operands;
+            assign m_in = operand(m);
         end else begin : memory
             reg [BITS-1:0] step, v_step;
             wire [BITS-1:0] at = load ? {BITS{1'b0}} : step;
@@ -81,17 +88,12 @@ module upb_network_parallel #(
             upb_rom #(.WIDTH(UNITS * WBITS), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(V)) rom_v (
                 .clk(clk), .address(v_at), .q(v_now)
             );
-            upb_shift #(.WIDTH(6 * XBITS), .DEPTH(1)) late_e (.clk(clk), .d(e), .q(e_now));
-            upb_shift #(.WIDTH(XBITS), .DEPTH(1)) late_m (.clk(clk), .d(m), .q(m_in));
+            upb_shift #(.WIDTH(6 * XBITS), .DEPTH(1)) late_e (.clk(clk), .d(operands), .q(e_now));
+            upb_shift #(.WIDTH(XBITS), .DEPTH(1)) late_m (.clk(clk), .d(operand(m)), .q(m_in));
         end
     endgenerate
 
-    // ------------------------------------------------------------------ operands as signed numbers
-    function automatic signed [XS-1:0] operand(input [XBITS-1:0] x);
-        if (XBITS == 16) operand = {~x[XBITS-1], x[XBITS-2:0]};
-        else operand = {1'b0, x};
-    endfunction
-
+    // ------------------------------------------------------------------ products
     localparam integer PW = XS + WBITS;  // of a product W * e
     localparam integer PM = XS + 16;
     wire [UNITS*32-1:0] vz;
@@ -102,7 +104,7 @@ module upb_network_parallel #(
             reg  [6*PW-1:0] p1;
             reg  signed [PM-1:0] pm1;
             for (genvar i = 0; i < 6; i = i + 1) begin : input_
-                wire signed [XS-1:0] x = operand(e_now[i*XBITS +: XBITS]);
+                wire signed [XS-1:0] x = e_now[i*XBITS +: XBITS];  // eight bits are positive
                 if (FOLD == 1) begin : baked
                     localparam signed [WBITS-1:0] WEIGHT = W[(6*u+i)*WBITS +: WBITS];
                     upb_constant_product #(.IN(XS), .OUT(PW), .FACTOR(WEIGHT)) product (
@@ -112,7 +114,7 @@ module upb_network_parallel #(
                     assign p[i*PW +: PW] = x * $signed(w_now[(6*u+i)*WBITS +: WBITS]);
                 end
             end
-            wire signed [XS-1:0] least = operand(m_in);
+            wire signed [XS-1:0] least = m_in;
             if (FOLD == 1) begin : baked_m
                 localparam signed [15:0] WEIGHT = M[u*16 +: 16];
                 upb_constant_product #(.IN(XS), .OUT(PM), .FACTOR(WEIGHT)) product (.x(least), .product(pm));

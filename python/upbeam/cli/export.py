@@ -38,6 +38,8 @@ class _Options:
     frames: int | None
     seed: int | None
     method: str | None
+    fold: int | None
+    lanes: int | None
 
 
 def export(
@@ -64,10 +66,14 @@ def export(
     method: Annotated[
         str | None, typer.Option(help=f"onnx-qdq: minmax, percentile or entropy ({DEFAULT_METHOD} if omitted).")
     ] = None,
+    fold: Annotated[
+        int | None, typer.Option(help="rtl: clocks of a window (one hidden unit a clock if omitted).")
+    ] = None,
+    lanes: Annotated[int | None, typer.Option(help="rtl: windows side by side, a divisor of the fold.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write a model as an ONNX graph, a C header or RTL memories. What each holds: docs/export.md."""
-    options = _Options(network, precision, calibrate, frames, seed, method)
+    options = _Options(network, precision, calibrate, frames, seed, method, fold, lanes)
     _check(to, options)
     loaded = load_model(model)
     source = Source.of(loaded.data, Path(model).name.removesuffix(".ubm"))
@@ -76,7 +82,7 @@ def export(
         _check_file(path)
     summary = {"model": source.name, "model_crc32": f"{source.crc32:08x}", "to": to, "output": str(path)}
     if to == "rtl":
-        summary |= _write_rtl(source, path, _precisions(options))
+        summary |= _write_rtl(source, path, options)
     elif to == "c":
         summary |= _write_c(source, path, _precisions(options))
     else:
@@ -95,6 +101,7 @@ def _check(to: str, options: _Options) -> None:
         "network": ONNX,
         "precision": ("c", "rtl"),
         **dict.fromkeys(("calibrate", "frames", "seed", "method"), (ONNX_QDQ,)),
+        **dict.fromkeys(("fold", "lanes"), ("rtl",)),
     }
     for name, targets in uses.items():
         if getattr(options, name) is not None and to not in targets:
@@ -135,10 +142,11 @@ def _write_c(source: Source, path: Path, precisions: list[Precision] | None) -> 
     return {"bytes": len(text), "precisions": found, "text": f"C header with {arrays}"}
 
 
-def _write_rtl(source: Source, folder: Path, precisions: list[Precision] | None) -> dict[str, Any]:
+def _write_rtl(source: Source, folder: Path, options: _Options) -> dict[str, Any]:
     from upbeam.quant.export.rtl import write_rtl
 
-    manifest = write_rtl(source, folder, precisions)
+    lanes = 1 if options.lanes is None else options.lanes
+    manifest = write_rtl(source, folder, _precisions(options), fold=options.fold, lanes=lanes)
     files = {name: size for made in manifest["precisions"].values() for name, size in made["files"].items()}
     found = list(manifest["precisions"])
     text = f"{len(files)} files of the {' and '.join(found)} networks"
