@@ -4,7 +4,8 @@
 //   s_axis -> skid -> receiver -> columns -> fill -> minimum -> block code -> networks -> output -> FIFO -> m_axis
 //
 // In:  s_axis_tdata = {intensity[7:0], distance[15:0]}, one beam a beat, beam 0 first; tlast with beam 31;
-//      tuser[0] with the first beat of a frame; tuser[1] with the last beat of a column after which the stream ends (an edge).
+//      tuser[0] with the first beat of a frame; tuser[1] with the last beat of a column after which the stream ends (an edge),
+//      with any other beat of a column that never arrived and was inserted: it counts as incomplete.
 // Out: m_axis_tdata = {generated intensity, generated distance, sensor intensity, sensor distance}: rows 2 k + 1 and 2 k at beat k;
 //      tlast with beat 31; tuser[0] with the first beat of a frame, tuser[1] in columns that came incomplete.
 // Column c leaves while column c + 1 arrives, or after it an edge. A beat is taken every FOLD / LANES clocks.
@@ -14,7 +15,8 @@
 // of registers alone. Latencies: docs/fpga.md; power/cycles/fpga_core.py calculates them.
 module upb_core #(
     parameter integer LANES = upb_pkg::UPB_LANES,
-    parameter integer FOLD = upb_pkg::UPB_FOLD
+    parameter integer FOLD = upb_pkg::UPB_FOLD,
+    parameter integer WRITABLE = 0     // weights in memories that can be written (upb_top), not in ROMs; the same timing
 ) (
     input  wire        aclk,
     input  wire        aresetn,           // synchronous, low: reset, for at least 64 clocks
@@ -40,7 +42,14 @@ module upb_core #(
     output wire        ev_short_frame,
     output wire        ev_long_frame,
     output wire        ev_dropped,        // a beat was dropped while waiting for a frame
-    output wire        ev_overrun         // the FIFO lost a beat: never, by construction
+    output wire        ev_overrun,        // the FIFO lost a beat: never, by construction
+
+    // WRITABLE: weights in two banks. The first window of a frame changes banks while weights_swap is high; ev_swapped: no window
+    // of the old one is under way, weights_swap may fall.
+    input  wire [44:0] weights,           // {write, word address[11:0], data}: to the bank that is not in use
+    input  wire        weights_bank,      // in use after reset
+    input  wire        weights_swap,
+    output wire        ev_swapped
 );
     localparam integer HIDDEN = upb_pkg::UPB_HIDDEN;
     localparam integer INTERVAL = FOLD / (LANES < 1 ? 1 : LANES);  // clocks between slots
@@ -60,6 +69,9 @@ module upb_core #(
                  "upb_core: weights must have 8 bits with the block code (int8) and 16 without (int16)")
     `UPB_REQUIRE(upb_pkg::UPB_CONFIG_CRC32 == upb_pkg::UPB_MODEL_CRC32, other_model,
                  "upb_core: upb_config.svh and upb_params.svh are of different models")
+    `UPB_REQUIRE(WRITABLE == 0 || FOLD > 1, bad_writable, "upb_core: WRITABLE needs FOLD > 1: with FOLD 1 weights are constants")
+    `UPB_REQUIRE(WRITABLE == 0 || FOLD <= HIDDEN || LANES == 1, bad_writable_lanes,
+                 "upb_core: WRITABLE with FOLD beyond the hidden units needs LANES 1")
 
     // ------------------------------------------------------------------ times, in clocks after the slot
     localparam integer NETWORK = PHASES == 1
@@ -148,6 +160,40 @@ module upb_core #(
     wire [15:0] m_late;
     upb_shift #(.WIDTH(16), .DEPTH(CODE)) late_m (.clk(clk), .d(m), .q(m_late));
 
+    // ------------------------------------------------------------------ banks of weights
+    wire [44:0] port, port_grey;
+    wire bank_code, bank_minimum;
+    generate
+        if (WRITABLE == 0) begin : baked
+            assign {port, port_grey} = 90'd0;
+            assign {bank_code, bank_minimum, ev_swapped} = 3'b000;
+        end else begin : banks
+            localparam integer DRAIN = AT_WRITE - AT_WINDOW;
+            reg bank, swapped;
+            reg [$clog2(DRAIN+1)-1:0] drain;
+            reg [44:0] port_r, port_grey_r;
+            wire change = at[AT_WINDOW] && valid && starts && weights_swap && !swapped;
+            always @(posedge clk) begin
+                if (change) bank <= !bank;
+                if (change) drain <= DRAIN;
+                else if (drain != 0) drain <= drain - 1'b1;
+                swapped <= weights_swap && (swapped || change);
+                port_r <= {!bank, weights[44] && !weights[43], weights[42:32], weights[31:0]};
+                port_grey_r <= {!bank, weights[44] && weights[43], weights[42:32], weights[31:0]};
+                if (rst) begin
+                    bank <= weights_bank;
+                    swapped <= 1'b0;
+                    drain <= 0;
+                end
+            end
+            assign ev_swapped = drain == 1;
+            assign port = port_r;
+            assign port_grey = port_grey_r;
+            upb_shift #(.WIDTH(1), .DEPTH(AT_MINIMUM - AT_WINDOW - 1)) to_minimum (.clk(clk), .d(bank), .q(bank_minimum));
+            upb_shift #(.WIDTH(1), .DEPTH(AT_CODE - AT_WINDOW - 1)) to_code (.clk(clk), .d(bank), .q(bank_code));
+        end
+    endgenerate
+
     // ------------------------------------------------------------------ steps 4 to 7
     wire [31:0] total, total_grey;
     upb_network #(
@@ -157,9 +203,10 @@ module upb_core #(
         .WORDS_W(upb_pkg::UPB_STEP_W_BITS), .WORDS_M(upb_pkg::UPB_STEP_M_BITS),
         .WORDS_B(upb_pkg::UPB_STEP_B_BITS), .WORDS_V(upb_pkg::UPB_STEP_V_BITS),
         .W(upb_pkg::UPB_DISTANCE_STEP_W), .M(upb_pkg::UPB_DISTANCE_STEP_M),
-        .B(upb_pkg::UPB_DISTANCE_STEP_B), .V(upb_pkg::UPB_DISTANCE_STEP_V)
+        .B(upb_pkg::UPB_DISTANCE_STEP_B), .V(upb_pkg::UPB_DISTANCE_STEP_V), .WRITABLE(WRITABLE)
     ) distance (
-        .clk(clk), .rst(rst), .strobe(at[AT_CODE]), .chosen(at[AT_TOTAL-1]), .e(e), .m(m_late), .total(total)
+        .clk(clk), .rst(rst), .strobe(at[AT_CODE]), .chosen(at[AT_TOTAL-1]), .bank(bank_code), .port(port),
+        .e(e), .m(m_late), .total(total)
     );
     upb_network #(
         .LANES(LANES), .FOLD(FOLD), .HIDDEN(HIDDEN), .XBITS(8), .WBITS(upb_pkg::UPB_WEIGHT_BITS),
@@ -168,9 +215,9 @@ module upb_core #(
         .WORDS_W(upb_pkg::UPB_STEP_W_BITS), .WORDS_M(upb_pkg::UPB_STEP_M_BITS),
         .WORDS_B(upb_pkg::UPB_STEP_B_BITS), .WORDS_V(upb_pkg::UPB_STEP_V_BITS),
         .W(upb_pkg::UPB_INTENSITY_STEP_W), .M(upb_pkg::UPB_INTENSITY_STEP_M),
-        .B(upb_pkg::UPB_INTENSITY_STEP_B), .V(upb_pkg::UPB_INTENSITY_STEP_V)
+        .B(upb_pkg::UPB_INTENSITY_STEP_B), .V(upb_pkg::UPB_INTENSITY_STEP_V), .WRITABLE(WRITABLE)
     ) intensity (
-        .clk(clk), .rst(rst), .strobe(at[AT_MINIMUM]), .chosen(at[AT_GREY-1]),
+        .clk(clk), .rst(rst), .strobe(at[AT_MINIMUM]), .chosen(at[AT_GREY-1]), .bank(bank_minimum), .port(port_grey),
         .e(d_grey), .m(m_grey), .total(total_grey)
     );
 

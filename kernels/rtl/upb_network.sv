@@ -21,11 +21,14 @@ module upb_network #(
     parameter [WORDS_W-1:0] W = 0,   // FOLD > HIDDEN: all weights in the order of the schedule
     parameter [WORDS_M-1:0] M = 0,
     parameter [WORDS_B-1:0] B = 0,
-    parameter [WORDS_V-1:0] V = 0
+    parameter [WORDS_V-1:0] V = 0,
+    parameter integer WRITABLE = 0
 ) (
     input  wire               clk,
     input  wire               rst,
     input  wire               strobe,
+    input  wire               bank,    // WRITABLE: of the weights, with strobe
+    input  wire [       44:0] port,
     input  wire               chosen,  // strobe, LATENCY - 1 clocks later; of no use with one lane
     input  wire [6*XBITS-1:0] e,
     input  wire [  XBITS-1:0] m,
@@ -35,15 +38,16 @@ module upb_network #(
     wire [LANES*32-1:0] totals;
     generate
         for (genvar l = 0; l < LANES; l = l + 1) begin : lane
-            wire load;
+            wire load, bank_in;
             wire [6*XBITS-1:0] e_in;
             wire [XBITS-1:0] m_in;
             if (LANES == 1) begin : all
                 assign load = strobe;
+                assign bank_in = bank;
                 assign e_in = e;
                 assign m_in = m;
             end else begin : mine
-                reg loaded;
+                reg loaded, bank_kept;
                 reg [6*XBITS-1:0] e_kept;
                 reg [XBITS-1:0] m_kept;
                 reg [LANE_BITS-1:0] turn;
@@ -53,24 +57,30 @@ module upb_network #(
                     if (my_turn) begin
                         e_kept <= e;
                         m_kept <= m;
+                        bank_kept <= bank;
                     end
                     if (rst) turn <= {LANE_BITS{1'b0}};
                     else if (strobe) turn <= turn == LANES - 1 ? {LANE_BITS{1'b0}} : turn + 1'b1;
                 end
                 assign load = loaded;
+                assign bank_in = bank_kept;
                 assign e_in = e_kept;
                 assign m_in = m_kept;
             end
             if (PHASES == 1) begin : parallel
                 upb_network_parallel #(
                     .XBITS(XBITS), .WBITS(WBITS), .UNITS(UNITS), .FOLD(FOLD), .K(K), .J(J), .SLOPE(SLOPE),
-                    .RECTIFY(RECTIFY), .C(C), .W(W), .M(M), .B(B), .V(V)
-                ) unit (.clk(clk), .rst(rst), .load(load), .e(e_in), .m(m_in), .total(totals[l*32 +: 32]));
+                    .RECTIFY(RECTIFY), .C(C), .W(W), .M(M), .B(B), .V(V), .WRITABLE(WRITABLE)
+                ) unit (
+                    .clk(clk), .rst(rst), .load(load), .bank(bank_in), .port(port), .e(e_in), .m(m_in), .total(totals[l*32 +: 32])
+                );
             end else begin : serial
                 upb_network_serial #(
                     .XBITS(XBITS), .WBITS(WBITS), .HIDDEN(HIDDEN), .PHASES(PHASES), .BEHIND(BEHIND), .K(K), .J(J),
-                    .SLOPE(SLOPE), .RECTIFY(RECTIFY), .C(C), .X(W), .B(B)
-                ) unit (.clk(clk), .rst(rst), .load(load), .e(e_in), .m(m_in), .total(totals[l*32 +: 32]));
+                    .SLOPE(SLOPE), .RECTIFY(RECTIFY), .C(C), .X(W), .B(B), .WRITABLE(WRITABLE)
+                ) unit (
+                    .clk(clk), .rst(rst), .load(load), .bank(bank_in), .port(port), .e(e_in), .m(m_in), .total(totals[l*32 +: 32])
+                );
             end
         end
         if (LANES == 1) begin : only

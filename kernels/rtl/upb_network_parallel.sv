@@ -23,11 +23,14 @@ module upb_network_parallel #(
     parameter [FOLD*UNITS*6*WBITS-1:0] W = 0,
     parameter [FOLD*UNITS*16-1:0] M = 0,
     parameter [FOLD*UNITS*32-1:0] B = 0,
-    parameter [FOLD*UNITS*WBITS-1:0] V = 0
+    parameter [FOLD*UNITS*WBITS-1:0] V = 0,
+    parameter integer WRITABLE = 0   // FOLD > 1: weights can be written; see upb_memory
 ) (
     input  wire               clk,
     input  wire               rst,
     input  wire               load,
+    input  wire               bank,    // WRITABLE: of the weights, with load
+    input  wire [       44:0] port,
     input  wire [6*XBITS-1:0] e,
     input  wire [  XBITS-1:0] m,
     output wire [       31:0] total
@@ -41,6 +44,31 @@ module upb_network_parallel #(
 
     wire [TO_SUM:0] loaded;
     upb_strobes #(.DEPTH(TO_SUM)) times (.clk(clk), .rst(rst), .d(load), .tap(loaded));
+
+    // ------------------------------------------------------------------ which bank, and C
+    // The bank of a window is there with its load and goes along with it.
+    wire now_bank, v_bank;
+    wire [31:0] c_now;
+    generate
+        if (WRITABLE == 0) begin : one_bank
+            assign {now_bank, v_bank} = 2'b00;
+            assign c_now = C;
+        end else begin : two_banks
+            reg kept_bank;
+            wire sum_bank;
+            reg [31:0] c0 = C, c1 = C;
+            always @(posedge clk) begin
+                kept_bank <= now_bank;
+                if (port[43] && port[42:40] == 3'd4)
+                    if (port[44]) c1 <= port[31:0];
+                    else c0 <= port[31:0];
+            end
+            assign now_bank = load ? bank : kept_bank;
+            upb_shift #(.WIDTH(1), .DEPTH(TO_V - 1)) to_v (.clk(clk), .d(now_bank), .q(v_bank));
+            upb_shift #(.WIDTH(1), .DEPTH(TO_SUM)) to_sum (.clk(clk), .d(now_bank), .q(sum_bank));
+            assign c_now = sum_bank ? c1 : c0;
+        end
+    endgenerate
 
     // ------------------------------------------------------------------ weights, one word a clock
     wire [UNITS*6*WBITS-1:0] w_now;
@@ -74,19 +102,19 @@ module upb_network_parallel #(
                     step <= at == FOLD - 1 ? {BITS{1'b0}} : at + 1'b1;
                     v_step <= v_at == FOLD - 1 ? {BITS{1'b0}} : v_at + 1'b1;
                 end
-            upb_rom #(.WIDTH(UNITS * 6 * WBITS), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(W)) rom_w (
-                .clk(clk), .address(at), .q(w_now)
+            upb_memory #(.WIDTH(UNITS * 6 * WBITS), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(W), .WRITABLE(WRITABLE), .SELECT(3'd0)) rom_w (
+                .clk(clk), .bank(now_bank), .port(port), .address(at), .q(w_now)
             );
-            upb_rom #(.WIDTH(UNITS * 16), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(M)) rom_m (
-                .clk(clk), .address(at), .q(m_now)
+            upb_memory #(.WIDTH(UNITS * 16), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(M), .WRITABLE(WRITABLE), .SELECT(3'd1)) rom_m (
+                .clk(clk), .bank(now_bank), .port(port), .address(at), .q(m_now)
             );
             wire [UNITS*32-1:0] b_read;
-            upb_rom #(.WIDTH(UNITS * 32), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(B)) rom_b (
-                .clk(clk), .address(at), .q(b_read)
+            upb_memory #(.WIDTH(UNITS * 32), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(B), .WRITABLE(WRITABLE), .SELECT(3'd2)) rom_b (
+                .clk(clk), .bank(now_bank), .port(port), .address(at), .q(b_read)
             );
             upb_shift #(.WIDTH(UNITS * 32), .DEPTH(1)) late_b (.clk(clk), .d(b_read), .q(b_now));
-            upb_rom #(.WIDTH(UNITS * WBITS), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(V)) rom_v (
-                .clk(clk), .address(v_at), .q(v_now)
+            upb_memory #(.WIDTH(UNITS * WBITS), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(V), .WRITABLE(WRITABLE), .SELECT(3'd3)) rom_v (
+                .clk(clk), .bank(v_bank), .port(port), .address(v_at), .q(v_now)
             );
             upb_shift #(.WIDTH(6 * XBITS), .DEPTH(1)) late_e (.clk(clk), .d(operands), .q(e_now));
             upb_shift #(.WIDTH(XBITS), .DEPTH(1)) late_m (.clk(clk), .d(operand(m)), .q(m_in));
@@ -165,6 +193,6 @@ module upb_network_parallel #(
     wire [31:0] products;
     upb_sum #(.N(UNITS), .WIDTH(32)) tree (.clk(clk), .terms(vz), .total(products));
     reg [31:0] sum;
-    always @(posedge clk) sum <= (loaded[TO_SUM] ? C : sum) + products;
+    always @(posedge clk) sum <= (loaded[TO_SUM] ? c_now : sum) + products;
     assign total = sum;
 endmodule

@@ -19,11 +19,14 @@ module upb_network_serial #(
     parameter integer RECTIFY = 1,
     parameter [31:0] C = 32'd0,
     parameter [HIDDEN*8*16-1:0] X = 0,
-    parameter [HIDDEN*32-1:0] B = 0
+    parameter [HIDDEN*32-1:0] B = 0,
+    parameter integer WRITABLE = 0   // weights can be written; see upb_memory
 ) (
     input  wire               clk,
     input  wire               rst,
     input  wire               load,
+    input  wire               bank,    // WRITABLE: of the weights, with load
+    input  wire [       44:0] port,
     input  wire [6*XBITS-1:0] e,
     input  wire [  XBITS-1:0] m,
     output reg  [       31:0] total
@@ -41,6 +44,33 @@ module upb_network_serial #(
                  "upb_network_serial: PHASES must be 2, 4 or 8")
     `UPB_REQUIRE(BEHIND * PHASES >= RECTIFY + 5 && BEHIND * PHASES < RECTIFY + 5 + PHASES, bad_behind,
                  "upb_network_serial: BEHIND does not meet the clock at which z is ready")
+    `UPB_REQUIRE(WRITABLE == 0 || BEHIND <= HIDDEN, bad_writable,
+                 "upb_network_serial: WRITABLE needs as many hidden units as a unit's V is behind")
+
+    // ------------------------------------------------------------------ which bank, and C
+    // V of a window is read beside W of the next one, of the same word: banks change after a window that counts for nothing (beam 0
+    // has none), so that no V is read of the wrong bank.
+    wire now_bank, b_bank, c_bank;
+    wire [31:0] c_now;
+    generate
+        if (WRITABLE == 0) begin : one_bank
+            assign {now_bank, b_bank, c_bank} = 3'b000;
+            assign c_now = C;
+        end else begin : two_banks
+            reg kept_bank;
+            reg [31:0] c0 = C, c1 = C;
+            always @(posedge clk) begin
+                kept_bank <= now_bank;
+                if (port[43] && port[42:40] == 3'd4)
+                    if (port[44]) c1 <= port[31:0];
+                    else c0 <= port[31:0];
+            end
+            assign now_bank = load ? bank : kept_bank;
+            upb_shift #(.WIDTH(1), .DEPTH(2)) to_b (.clk(clk), .d(now_bank), .q(b_bank));
+            upb_shift #(.WIDTH(1), .DEPTH(3)) to_c (.clk(clk), .d(now_bank), .q(c_bank));
+            assign c_now = c_bank ? c1 : c0;
+        end
+    endgenerate
 
     // ------------------------------------------------------------------ clock 0: which step
     reg [BITS-1:0] step;
@@ -64,8 +94,11 @@ module upb_network_serial #(
 
     // ------------------------------------------------------------------ clock 1: weights
     wire [MULTIPLIERS*WORD-1:0] word1;
-    upb_rom #(.WIDTH(MULTIPLIERS * WORD), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(X)) rom (
-        .clk(clk), .address(at), .q(word1)
+    upb_memory #(
+        .WIDTH(MULTIPLIERS * WORD), .DEPTH(FOLD), .ADDRESS(BITS), .INIT(X),
+        .WRITABLE(WRITABLE), .SELECT(3'd0)
+    ) rom (
+        .clk(clk), .bank(now_bank), .port(port), .address(at), .q(word1)
     );
     reg [6*XBITS-1:0] e1;
     reg [XBITS-1:0] m1;
@@ -116,8 +149,11 @@ module upb_network_serial #(
     wire [31:0] b3;
     wire [BITS-1:0] at2;
     upb_shift #(.WIDTH(BITS), .DEPTH(2)) to_unit (.clk(clk), .d(at), .q(at2));
-    upb_rom #(.WIDTH(32), .DEPTH(HIDDEN), .ADDRESS(BITS), .INIT(B)) biases (
-        .clk(clk), .address(at2 >> PHASE_BITS), .q(b3)
+    upb_memory #(
+        .WIDTH(32), .DEPTH(HIDDEN), .ADDRESS(BITS), .INIT(B),
+        .WRITABLE(WRITABLE), .SELECT(3'd2)
+    ) biases (
+        .clk(clk), .bank(b_bank), .port(port), .address(at2 >> PHASE_BITS), .q(b3)
     );
 
     wire signed [31:0] m_product = $signed(product3[M_AT*PB +: PB]);
@@ -129,7 +165,7 @@ module upb_network_serial #(
         sum5 <= (phase4 == 0 ? {SUM{1'b0}} : sum5) + part4;
         if (phase3 == M_PHASE) mb <= (m_product <<< J) + b3;
         if (phase5 == PHASES - 1) S <= (w_sum <<< K) + mb;
-        if (phase3 == V_PHASE) total <= (zero3 ? C : total) + v_product;
+        if (phase3 == V_PHASE) total <= (zero3 ? c_now : total) + v_product;
     end
 
     upb_rectifier #(.SLOPE(SLOPE), .LATENCY(RECTIFY)) rectifier (

@@ -1,7 +1,8 @@
 // upb_receiver: makes whole columns of what arrives.
 //
 // In:  beats {user[1:0], last, intensity, distance}, one beam each; a column is 32 beats, the last one marked.
-//      user[0] on the first beat of a frame; user[1] on the last beat of a column: the stream ends here (an edge).
+//      user[0] on the first beat of a frame; user[1] on the last beat of a column: the stream ends here (an edge); on any other
+//      beat: the column is incomplete (inserted for one that never arrived).
 // Out: at most one beat a slot, always 32 to a column, beam 0 first; `real_` is low in columns that stand for an edge.
 //
 // What does not fit is flagged (one-clock events), never passed on as something else:
@@ -24,7 +25,7 @@ module upb_receiver #(
     input  wire [26:0] in_data,
     output reg         beat,            // valid with the strobe after `slot`
     output reg         real_,
-    output reg         padded,          // of the column: it was short
+    output reg         padded,          // of the column, valid with its last beat: it was short or marked incomplete
     output reg         first,           // of the column: it begins a frame
     output reg  [ 4:0] beam,
     output reg  [23:0] data,
@@ -42,21 +43,20 @@ module upb_receiver #(
     reg         resync;     // after the edge: wait for a new frame
     reg  [ 4:0] next_beam;
     reg  [15:0] done;       // columns of this frame
-    reg         some;       // there is one
-    reg         nearly;     // the next one is the last: known long before its beam 31
-    reg         whole;      // all are there
+    reg         marked;     // the column at hand is marked incomplete
 
     wire        last = in_data[24];
     wire        starts = in_data[25];
     wire        ends = in_data[26];
     wire        top = next_beam == 5'd0;
     wire        bottom = next_beam == 5'd31;
+    wire        whole = done == columns;
     wire        go = slot && room;
     wire        head = go && in_valid;
 
     // The beat at hand begins a frame in the middle of a column or of a frame, or is one column too many: it waits.
     wire        cut_column = starts && !top;
-    wire        cut_frame = starts && top && !whole && some;
+    wire        cut_frame = starts && top && !whole && done != 16'd0;
     wire        beyond = !starts && top && whole;
     wire        waits = cut_column || cut_frame || beyond;
     wire        drop = state == SYNC && head && !starts;
@@ -64,10 +64,10 @@ module upb_receiver #(
     assign in_ready = take || drop;
 
     wire closes = take && bottom;
-    wire edge_after = ends || (EDGE_SEAM == 0 && nearly);
+    wire [15:0] done_now = done + 16'd1;
+    wire edge_after = ends || (EDGE_SEAM == 0 && done_now == columns);
 
     always @(posedge clk) begin
-        nearly <= done + 16'd1 == columns;
         ev_column <= closes;
         ev_frame <= take && starts;
         ev_short_column <= (state == RUN && head && cut_column) || (take && last && !bottom);
@@ -79,7 +79,9 @@ module upb_receiver #(
         if (slot) begin
             beat <= take || (go && (state == PAD || state == EDGE));
             real_ <= state != EDGE;
-            padded <= state == PAD;
+            padded <= state == PAD || (marked && !top);
+            if (take) marked <= ends && !bottom || marked && !top && !bottom;
+            else if (state != RUN) marked <= 1'b0;
             beam <= next_beam;
             data <= take ? in_data[23:0] : 24'd0;
             if (top) first <= take && starts;
@@ -91,20 +93,12 @@ module upb_receiver #(
                     state <= RUN;
                     next_beam <= 5'd0;
                     done <= 16'd0;
-                    {some, whole} <= 2'b00;
                 end
             RUN:
                 if (take) begin
                     next_beam <= next_beam + 5'd1;
-                    if (top && starts) begin
-                        done <= 16'd0;
-                        {some, whole} <= 2'b00;
-                    end
-                    if (bottom) begin
-                        done <= done + 16'd1;
-                        some <= 1'b1;
-                        whole <= nearly;
-                    end
+                    if (top && starts) done <= 16'd0;
+                    if (bottom) done <= done_now;
                     if (last && !bottom) begin
                         state <= PAD;
                         resync <= 1'b1;
@@ -136,7 +130,6 @@ module upb_receiver #(
             resync <= 1'b0;
             next_beam <= 5'd0;
             done <= 16'd0;
-            {some, whole} <= 2'b00;
             beat <= 1'b0;
         end
     end

@@ -29,6 +29,7 @@ from upbeam.quant.integer import (
 )
 from upbeam.quant.sizes import weight_bytes
 
+from .rtl_beams import BEAMS, beams_header
 from .rtl_schedule import Configuration, Words, words
 from .source import NETWORKS, ExportError, NetworkName, Source, new_folder
 
@@ -105,11 +106,12 @@ def _texts(source: Source, model: IntegerModel, fold: int | None, lanes: int) ->
 
 
 def core_headers(source: Source, precision: Precision, *, fold: int | None = None, lanes: int = 1) -> dict[str, str]:
-    """The two headers that ``kernels/rtl/upb_pkg.sv`` includes, by file name."""
+    """The two headers that ``kernels/rtl/upb_pkg.sv`` includes and the one of ``upb_top.sv``, by file name."""
     chosen = configuration(source.integer(precision), fold=fold, lanes=lanes)
     return {
         PARAMETERS: parameters(source, precision),
         CONFIGURATION: configuration_header(source, precision, chosen),
+        BEAMS: beams_header(source),
     }
 
 
