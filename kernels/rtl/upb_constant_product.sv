@@ -8,7 +8,9 @@ module upb_constant_product #(
     parameter signed [31:0] FACTOR = 1
 ) (
     input  wire [ IN-1:0] x,         // signed, as is product
-    output wire [OUT-1:0] product
+    output wire [OUT-1:0] added,     // of the digits 1
+    output wire [OUT-1:0] taken,     // of the digits -1
+    output wire [OUT-1:0] product    // added - taken
 );
     // The canonical form of f has +1 at digit n where bit n + 1 is set in 3 f and not in f, -1 the other way round.
     localparam signed [34:0] WIDE = FACTOR;
@@ -52,5 +54,7 @@ module upb_constant_product #(
         tree = ((t[0 +: OUT] + t[OUT +: OUT]) + (t[2*OUT +: OUT] + t[3*OUT +: OUT]))
              + ((t[4*OUT +: OUT] + t[5*OUT +: OUT]) + (t[6*OUT +: OUT] + t[7*OUT +: OUT]));
     endfunction
-    assign product = tree(plus) - tree(minus);
+    assign added = tree(plus);
+    assign taken = tree(minus);
+    assign product = added - taken;
 endmodule

@@ -128,15 +128,15 @@ module upb_network_parallel #(
     generate
         for (genvar u = 0; u < UNITS; u = u + 1) begin : unit
             wire signed [6*PW-1:0] p;
-            wire signed [PM-1:0] pm;
+            wire signed [PM-1:0] pm, pm_less;
             reg  [6*PW-1:0] p1;
-            reg  signed [PM-1:0] pm1;
+            reg  signed [PM-1:0] pm1, pm_less1;  // the product of M is their difference
             for (genvar i = 0; i < 6; i = i + 1) begin : input_
                 wire signed [XS-1:0] x = e_now[i*XBITS +: XBITS];  // eight bits are positive
                 if (FOLD == 1) begin : baked
                     localparam signed [WBITS-1:0] WEIGHT = W[(6*u+i)*WBITS +: WBITS];
                     upb_constant_product #(.IN(XS), .OUT(PW), .FACTOR(WEIGHT)) product (
-                        .x(x), .product(p[i*PW +: PW])
+                        .x(x), .added(), .taken(), .product(p[i*PW +: PW])
                     );
                 end else begin : multiplied
                     assign p[i*PW +: PW] = x * $signed(w_now[(6*u+i)*WBITS +: WBITS]);
@@ -145,9 +145,13 @@ module upb_network_parallel #(
             wire signed [XS-1:0] least = m_in;
             if (FOLD == 1) begin : baked_m
                 localparam signed [15:0] WEIGHT = M[u*16 +: 16];
-                upb_constant_product #(.IN(XS), .OUT(PM), .FACTOR(WEIGHT)) product (.x(least), .product(pm));
+                // Up to eight digits: the last sum is left to the next clock.
+                upb_constant_product #(.IN(XS), .OUT(PM), .FACTOR(WEIGHT)) product (
+                    .x(least), .added(pm), .taken(pm_less), .product()
+                );
             end else begin : multiplied_m
                 assign pm = least * $signed(m_now[u*16 +: 16]);
+                assign pm_less = {PM{1'b0}};
             end
 
             // S, modulo 2^32, as a tree of three levels. Only its upper half goes on.
@@ -157,14 +161,15 @@ module upb_network_parallel #(
             reg signed [PW:0] s01, s23, s45;
             reg signed [PW+1:0] s0123;
             reg [31:0] mb, s45mb, S;
-            wire signed [31:0] wide_m = pm1, wide_45 = s45, wide_0123 = s0123;
+            wire signed [31:0] wide_m = pm1, wide_less = pm_less1, wide_45 = s45, wide_0123 = s0123;
             always @(posedge clk) begin
                 p1 <= p;
                 pm1 <= pm;
+                pm_less1 <= pm_less;
                 s01 <= q0 + q1;
                 s23 <= q2 + q3;
                 s45 <= q4 + q5;
-                mb <= (wide_m <<< J) + b_now[u*32 +: 32];
+                mb <= (wide_m <<< J) - (wide_less <<< J) + b_now[u*32 +: 32];
                 s0123 <= s01 + s23;
                 s45mb <= (wide_45 <<< K) + mb;
                 S <= (wide_0123 <<< K) + s45mb;
@@ -178,7 +183,7 @@ module upb_network_parallel #(
             if (FOLD == 1) begin : baked_v
                 localparam signed [WBITS-1:0] WEIGHT = V[u*WBITS +: WBITS];
                 upb_constant_product #(.IN(16), .OUT(16 + WBITS), .FACTOR(WEIGHT)) product (
-                    .x(z), .product(pv)
+                    .x(z), .added(), .taken(), .product(pv)
                 );
             end else begin : multiplied_v
                 assign pv = $signed(z) * $signed(v_now[u*WBITS +: WBITS]);

@@ -21,7 +21,9 @@ module upb_rectifier #(
             reg  [31:0] leaked;
             reg  [15:0] a1;
             reg         enable1;
-            upb_constant_product #(.IN(16), .OUT(32), .FACTOR(SLOPE)) slope (.x(a), .product(product));
+            upb_constant_product #(.IN(16), .OUT(32), .FACTOR(SLOPE)) slope (
+                .x(a), .added(), .taken(), .product(product)
+            );
             wire [31:0] rounded = leaked + 32'd16384;
             always @(posedge clk) begin
                 leaked <= product;
