@@ -17,7 +17,7 @@ from typing import Literal
 
 from .tools import Tool, compiler, find_verilator, find_yosys, run
 
-__all__ = ["CACHE_VARIABLE", "SIMULATORS", "Simulator", "build", "cache_folder", "sources"]
+__all__ = ["CACHE_VARIABLE", "SIMULATORS", "Simulator", "build", "build_top", "cache_folder", "sources"]
 
 Simulator = Literal["verilator", "cxxrtl"]
 SIMULATORS: tuple[Simulator, ...] = ("verilator", "cxxrtl")
@@ -60,6 +60,24 @@ def build(headers: Mapping[str, str], simulator: Simulator = "verilator", *, tra
     return _kept(key, lambda folder: maker(folder, tool, files, trace), files)
 
 
+def build_top(headers: Mapping[str, str], parameters: Mapping[str, int], harness: str, text: str) -> Path:
+    """``upb_top`` with these parameters and a C++ harness around it, as a shared library (Verilator). Raises ToolError."""
+    tool = find_verilator()
+    files = {**sources(), **headers, harness: text}
+    flags = ["--top-module", "upb_top", *(f"-G{name}={value}" for name, value in parameters.items())]
+    key = (sorted(files.items()), flags, tool.version(), compiler())
+    return _kept(key, lambda folder: _shared_library(folder, tool, files, flags, harness), files)
+
+
+def _shared_library(folder: Path, tool: Tool, files: Mapping[str, str], flags: list[str], harness: str) -> Path:
+    _verilate(folder, tool, files, flags)
+    made = [str(path) for path in sorted((folder / "made").glob("*.cpp"))]
+    runtime = [str(_verilated_object(tool, False, name)) for name in _RUNTIME]
+    options = [*_verilated_options(tool, False), "-Imade", "-fPIC", "-shared", *made, harness, *runtime]
+    run([*compiler(), *_CXX, *options, "-o", "simulator.so"], folder, "the C++ compiler")
+    return folder / "simulator.so"
+
+
 def _kept(key: object, make: Callable[[Path], Path], files: Mapping[str, str]) -> Path:
     """The file of this key in the cache; made in a scratch folder that holds ``files`` if it is not there."""
     kept = cache_folder() / hashlib.sha256(repr(key).encode()).hexdigest()[:32]
@@ -82,16 +100,18 @@ def _units(files: Mapping[str, str]) -> list[str]:
 
 
 def _with_verilator(folder: Path, tool: Tool, files: Mapping[str, str], trace: bool) -> Path:
-    assert tool.root is not None
-    # Widths are chosen on purpose (sums modulo 2^32); every other warning stops the build.
-    flags = ["--cc", "-O3", "--x-assign", "unique", "--x-initial", "unique", "-Wno-WIDTH", "--assert"]
-    flags += ["--trace"] if trace else []
-    command = [*tool.command, *flags, "--top-module", TOP, "--Mdir", "made", "-I.", *_units(files)]
-    run(command, folder, tool.name, tool.environment())
+    _verilate(folder, tool, files, ["--top-module", TOP, *(["--trace"] if trace else [])])
     options = [*_verilated_options(tool, trace), "-Imade"]
     made = [str(path) for path in sorted((folder / "made").glob("*.cpp"))]
     runtime = [str(_verilated_object(tool, trace, name)) for name in (*_RUNTIME, *(_TRACE if trace else ()))]
     return _compile(folder, [*options, *made], runtime)
+
+
+def _verilate(folder: Path, tool: Tool, files: Mapping[str, str], more: list[str]) -> None:
+    # Widths are chosen on purpose (sums modulo 2^32); every other warning stops the build.
+    flags = ["--cc", "-O3", "--x-assign", "unique", "--x-initial", "unique", "-Wno-WIDTH", "--assert", *more]
+    command = [*tool.command, *flags, "--Mdir", "made", "-I.", *_units(files)]
+    run(command, folder, tool.name, tool.environment())
 
 
 def _verilated_options(tool: Tool, trace: bool) -> list[str]:
@@ -107,11 +127,11 @@ def _verilated_object(tool: Tool, trace: bool, name: str) -> Path:
     source = str(tool.root / "include" / name)
 
     def make(folder: Path) -> Path:
-        options = [*compiler(), *_CXX, *_verilated_options(tool, trace), "-c", source, "-o", "runtime.o"]
+        options = [*compiler(), *_CXX, *_verilated_options(tool, trace), "-fPIC", "-c", source, "-o", "runtime.o"]
         run(options, folder, "the C++ compiler")
         return folder / "runtime.o"
 
-    return _kept(("runtime", name, trace, tool.version(), compiler()), make, {})
+    return _kept(("runtime, -fPIC", name, trace, tool.version(), compiler()), make, {})
 
 
 def _with_yosys(folder: Path, tool: Tool, files: Mapping[str, str], trace: bool) -> Path:
