@@ -140,6 +140,7 @@ def c_header(m: RegisterMap) -> str:
     """``upb_regs.h``."""
     lines = [
         f"/* Register map of the upbeam FPGA core. {_NOTE} */",
+        "/* clang-format off */",
         "#ifndef UPB_REGS_H",
         "#define UPB_REGS_H",
         "",

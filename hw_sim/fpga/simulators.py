@@ -73,7 +73,8 @@ def _shared_library(folder: Path, tool: Tool, files: Mapping[str, str], flags: l
     _verilate(folder, tool, files, flags)
     made = [str(path) for path in sorted((folder / "made").glob("*.cpp"))]
     runtime = [str(_verilated_object(tool, False, name)) for name in _RUNTIME]
-    options = [*_verilated_options(tool, False), "-Imade", "-fPIC", "-shared", *made, harness, *runtime]
+    # -O1: such a simulator runs a few frames at most; compilation is most of its time.
+    options = [*_verilated_options(tool, False), "-O1", "-Imade", "-fPIC", "-shared", *made, harness, *runtime]
     run([*compiler(), *_CXX, *options, "-o", "simulator.so"], folder, "the C++ compiler")
     return folder / "simulator.so"
 

@@ -51,7 +51,8 @@ module upb_bytes (
         .m_axis_tdata(beat), .m_axis_tvalid(beat_valid), .m_axis_tready(beat_taken),
         .m_axis_tlast(beat_last), .m_axis_tuser(beat_user),
         .ev_column(events[0]), .ev_frame(events[1]), .ev_short_column(events[2]), .ev_long_column(events[3]),
-        .ev_short_frame(events[4]), .ev_long_frame(events[5]), .ev_dropped(events[6]), .ev_overrun(events[7])
+        .ev_short_frame(events[4]), .ev_long_frame(events[5]), .ev_dropped(events[6]), .ev_overrun(events[7]),
+        .weights(45'd0), .weights_bank(1'b0), .weights_swap(1'b0), .ev_swapped()
     );
     always @(posedge clk)
         if (!resetn) error <= 1'b0;

@@ -16,7 +16,7 @@
 module upb_destagger #(
     parameter integer SLOTS = 2,
     parameter integer DELAY = 1,
-    parameter [32*16-1:0] LAG = 512'd0
+    parameter [32*16-1:0] LAG = {16'd1, 496'd0}
 ) (
     input  wire        clk,
     input  wire        rst,

@@ -53,6 +53,7 @@ module upb_registers #(
     input  wire        out_beat,         // a beat leaves
     input  wire        out_last,
     input  wire        out_starts,
+    input  wire        out_waits,        // a beat is offered and not taken
 
     output reg  [44:0] weights,          // {write, word address[11:0], data}: to the bank that is not in use
     output reg         bank,             // in use
@@ -202,6 +203,13 @@ module upb_registers #(
         if (rst || !running) watching <= 1'b0;
     end
 
+    // A sink that is stuck from early on holds the last column back at the input, so that no frame is late: a beat is.
+    reg [31:0] waited;
+    wire stalls = deadline != 32'd0 && out_waits && waited == deadline;
+    always @(posedge clk)
+        if (rst || !out_waits) waited <= 32'd1;
+        else if (waited != 32'hffffffff) waited <= waited + 32'd1;
+
     // ------------------------------------------------------------------ events
     reg refused;
     wire [EVENT_BITS-1:0] set;
@@ -215,6 +223,7 @@ module upb_registers #(
     assign set[EVENTS_DROPPED] = ev_dropped;
     assign set[EVENTS_OVERRUN] = ev_overrun;
     assign set[EVENTS_WEIGHTS] = refused;
+    assign set[EVENTS_STALLED] = stalls;
     wire [EVENT_BITS-1:0] cleared = put && write_address == AT_EVENTS ? write_data[EVENT_BITS-1:0] : {EVENT_BITS{1'b0}};
     always @(posedge clk) begin
         // An event that comes while its flag is being cleared stays.

@@ -99,6 +99,7 @@ module upb_top #(
         .ev_column(ev_column), .ev_frame(ev_frame), .ev_short_column(ev_short_column), .ev_long_column(ev_long_column),
         .ev_short_frame(ev_short_frame), .ev_long_frame(ev_long_frame), .ev_dropped(ev_dropped), .ev_overrun(ev_overrun),
         .out_beat(m_axis_tvalid && m_axis_tready), .out_last(m_axis_tlast), .out_starts(m_axis_tuser[0]),
+        .out_waits(m_axis_tvalid && !m_axis_tready),
         .weights(weights), .bank(bank), .swap(swap), .ev_swapped(ev_swapped)
     );
 

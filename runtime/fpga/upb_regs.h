@@ -1,4 +1,5 @@
 /* Register map of the upbeam FPGA core. Generated from kernels/rtl/registers.toml; do not edit. */
+/* clang-format off */
 #ifndef UPB_REGS_H
 #define UPB_REGS_H
 
@@ -103,7 +104,7 @@
 /* rw: columns of a frame, 4 to 65535; from the model at reset. Written while the core runs, or beyond these limits: SLVERR */
 #define UPB_REG_COLUMNS 0x048u
 
-/* rw: clocks from a frame's last input column to its last output beat after which it has missed; 0: no deadline */
+/* rw: clocks from a frame's last input column to its last output beat after which it has missed (and that a beat may wait for the sink); 0: no deadline */
 #define UPB_REG_DEADLINE 0x04cu
 
 /* w1c: what has happened since it was cleared */
@@ -118,11 +119,12 @@
 #define UPB_EVENTS_DROPPED 0x00000080u /* error: beats were dropped while waiting for a frame */
 #define UPB_EVENTS_OVERRUN 0x00000100u /* error: the output FIFO lost a beat (a fault of the core) */
 #define UPB_EVENTS_WEIGHTS 0x00000200u /* error: a swap was refused: length or CRC-32 of what was written is another */
+#define UPB_EVENTS_STALLED 0x00000400u /* a beat has waited at m_axis for DEADLINE clocks: the sink is stuck, and soon the source will be */
 
 /* rw: bits of EVENTS that raise the interrupt, a level: high while any of them is set in both */
 #define UPB_REG_IRQ_ENABLE 0x054u
 
-/* ro: frames begun at the input, modulo 2^32, like all counters; ENABLE = 0 clears them */
+/* ro: frames begun at the input, modulo 2^32, like all counters; cleared when ENABLE rises */
 #define UPB_REG_FRAMES_IN 0x060u
 
 /* ro: whole columns taken */
