@@ -7,7 +7,7 @@ NATIVE := CMakeLists.txt $(shell find kernels/cpu runtime power/bench -name '*.[
 SHELL  := bash
 SHARED := $(firstword $(wildcard ../shared/data))
 
-.PHONY: help setup demo test test-c test-c-all test-train lint bench soak dist model stubs accuracy clean
+.PHONY: help setup demo test test-c test-c-all test-train lint bench soak fpga dist model stubs accuracy clean
 .DELETE_ON_ERROR:
 
 help:
@@ -17,6 +17,7 @@ help:
 	@echo "make setup       build .venv; the command line is then $(BIN)/upbeam"
 	@echo "make lint        style and types"
 	@echo "make bench       kernels beside their bound, compilers and other runtimes (minutes)"
+	@echo "make fpga        build the FPGA cores and renew their baselines (half an hour)"
 	@echo "make soak        the long runs (about 15 minutes)"
 	@echo "make model       train and quantise the shipped models anew"
 	@echo "make accuracy    every method beside every other (trains what is not shipped: half an hour)"
@@ -111,6 +112,10 @@ soak: test-c $(VENV)/.dev
 	build/c/tests/runtime/packets/fuzz_packets --count 10000000
 	build/c/runtime/daemon/test_daemon --count 10000000
 	$(BIN)/upbeam stream --frames 12000 --report build/soak
+
+# Synthesis, place and route of every core in hw_sim/fpga/baselines.json (half an hour); what is unchanged is kept.
+fpga: $(VENV)/.dev
+	$(BIN)/python -m upbeam.hw_sim.fpga.baselines build/fpga
 
 dist: $(VENV)/.dev
 	@rm -rf build/dist build/dist-venv

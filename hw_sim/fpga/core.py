@@ -14,7 +14,7 @@ from upbeam.quant.export.source import Source
 from upbeam.quant.integer import Precision
 
 from .beats import U8, U16, U32, U64, OutputColumns, image_beats, output_columns
-from .simulators import Simulator, build
+from .simulators import Simulator, Trace, build
 
 __all__ = ["EVENTS", "RtlCore", "Run", "SimulationError", "Traffic"]
 
@@ -89,9 +89,9 @@ class RtlCore:
         fold: int | None = None,
         lanes: int = 1,
         simulator: Simulator = "verilator",
-        trace: bool = False,
+        trace: Trace | None = None,
     ) -> None:
-        """``fold`` omitted: one hidden unit a clock. ``trace``: ``run`` can write a VCD.
+        """``fold`` omitted: one hidden unit a clock. ``trace``: what ``run`` can write.
 
         Raises ExportError, ConfigurationError and ToolError."""
         self.configuration = configuration(source.integer(precision), fold=fold, lanes=lanes)
@@ -105,12 +105,12 @@ class RtlCore:
         columns: int,
         traffic: Traffic | None = None,
         *,
-        vcd: Path | None = None,
+        trace: Path | None = None,
         timeout_s: float = 600,
     ) -> Run:
         """``beats``: see ``beats.py``; ``columns`` of a frame. Raises SimulationError where the core breaks a rule of
         AXI4-Stream or the simulator fails."""
-        if vcd is not None and not self.trace:
+        if trace is not None and not self.trace:
             raise ValueError("this simulator was built without trace")
         t = traffic or Traffic()
         options = {
@@ -123,8 +123,8 @@ class RtlCore:
             "quiet": 80 * self.configuration.interval + 500,
         }
         command = [str(self.program), *(text for key, value in options.items() for text in (f"--{key}", str(value)))]
-        if vcd is not None:
-            command += ["--vcd", str(vcd)]
+        if trace is not None:
+            command += ["--trace", str(trace)]
         done = subprocess.run(
             command,
             input=np.ascontiguousarray(beats, "<u4").tobytes(),

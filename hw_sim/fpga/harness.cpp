@@ -19,7 +19,13 @@
 #include "Vupb_core.h"
 #include "verilated.h"
 #if VM_TRACE
+#if VM_TRACE_SAIF
+#include "verilated_saif_c.h"
+using TraceFile = VerilatedSaifC;
+#else
 #include "verilated_vcd_c.h"
+using TraceFile = VerilatedVcdC;
+#endif
 #endif
 #endif
 
@@ -33,7 +39,7 @@ struct Options {
     std::uint64_t columns = 2048, seed = 1, quiet = 4000, max_clocks = 1000000000;
     std::uint64_t gap = 0, stall = 0;              // in 1/65536 of the clocks
     std::uint64_t stuck_from = 0, stuck_until = 0; // clocks in which the sink takes nothing
-    const char *vcd = nullptr;
+    const char *trace = nullptr;
 };
 
 struct Head {
@@ -120,10 +126,10 @@ class Bench {
     Bench(const Options &options, std::vector<std::uint32_t> beats)
         : options_(options), beats_(std::move(beats)), random_(options.seed) {
 #if VM_TRACE
-        if (options.vcd) {
+        if (options.trace) {
             Verilated::traceEverOn(true);
             core_.trace(&trace_, 99);
-            trace_.open(options.vcd);
+            trace_.open(options.trace);
         }
 #endif
     }
@@ -141,7 +147,7 @@ class Bench {
             idle = step() || waits ? 0 : idle + 1;
         }
 #if VM_TRACE
-        if (options_.vcd)
+        if (options_.trace)
             trace_.close();
 #endif
         return write();
@@ -152,7 +158,7 @@ class Bench {
         core_.aclk = level != 0;
         core_.eval();
 #if VM_TRACE
-        if (options_.vcd)
+        if (options_.trace)
             trace_.dump(time_);
 #endif
         time_++;
@@ -257,7 +263,7 @@ class Bench {
     std::vector<std::uint32_t> beats_;
     Random random_;
 #if VM_TRACE
-    VerilatedVcdC trace_;
+    TraceFile trace_;
 #endif
     Core core_;
     std::uint64_t clock_ = 0, time_ = 0, was_beat_ = 0, pending_stalls_ = 0;
@@ -284,9 +290,9 @@ bool parse(int argc, char **argv, Options &options) {
         {"--stuck-until", &options.stuck_until},
     };
     for (int n = 1; n + 1 < argc; n += 2) {
-        bool known = std::strcmp(argv[n], "--vcd") == 0;
+        bool known = std::strcmp(argv[n], "--trace") == 0;
         if (known)
-            options.vcd = argv[n + 1];
+            options.trace = argv[n + 1];
         for (const auto &number : numbers)
             if (std::strcmp(argv[n], number.name) == 0) {
                 *number.value = std::strtoull(argv[n + 1], nullptr, 10);

@@ -17,9 +17,11 @@ from typing import Literal
 
 from .tools import Tool, compiler, find_verilator, find_yosys, run
 
-__all__ = ["CACHE_VARIABLE", "SIMULATORS", "Simulator", "build", "build_top", "cache_folder", "sources"]
+__all__ = ["CACHE_VARIABLE", "SIMULATORS", "Simulator", "Trace", "build", "build_top", "cache_folder", "sources"]
 
 Simulator = Literal["verilator", "cxxrtl"]
+Trace = Literal["vcd", "saif"]
+"""Waveforms; toggles of each net"""
 SIMULATORS: tuple[Simulator, ...] = ("verilator", "cxxrtl")
 CACHE_VARIABLE = "UPBEAM_RTL_CACHE"
 """Environment variable: where built simulators are kept, ``~/.cache/upbeam/rtl`` without it."""
@@ -27,7 +29,6 @@ TOP = "upb_core"
 PACKAGE = "upb_pkg.sv"
 HARNESS = "harness.cpp"
 _RUNTIME = ("verilated.cpp", "verilated_threads.cpp")
-_TRACE = ("verilated_vcd_c.cpp",)
 _CXX = ("-O2", "-std=c++17", "-pthread")
 
 
@@ -46,12 +47,12 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "upbeam" / "rtl"
 
 
-def build(headers: Mapping[str, str], simulator: Simulator = "verilator", *, trace: bool = False) -> Path:
+def build(headers: Mapping[str, str], simulator: Simulator = "verilator", *, trace: Trace | None = None) -> Path:
     """The simulator of a configuration (``quant.export.rtl.core_headers``), from the cache or built (seconds).
 
-    ``trace``: it can write a VCD, and is slower (Verilator only). Raises ToolError."""
+    ``trace``: it can write that, and is slower (Verilator only). Raises ToolError."""
     if trace and simulator != "verilator":
-        raise ValueError("only Verilator writes a VCD here")
+        raise ValueError(f"only Verilator writes {trace} here")
     tool = find_verilator() if simulator == "verilator" else find_yosys()
     harness = resources.files("upbeam.hw_sim").joinpath("fpga").joinpath(HARNESS).read_text()
     files = {**sources(), **headers, HARNESS: harness}
@@ -61,7 +62,8 @@ def build(headers: Mapping[str, str], simulator: Simulator = "verilator", *, tra
 
 
 def build_top(headers: Mapping[str, str], parameters: Mapping[str, int], harness: str, text: str) -> Path:
-    """``upb_top`` with these parameters and a C++ harness around it, as a shared library (Verilator). Raises ToolError."""
+    """``upb_top`` with these parameters and a C++ harness around it, as a shared library (Verilator). Raises
+    ToolError."""
     tool = find_verilator()
     files = {**sources(), **headers, harness: text}
     flags = ["--top-module", "upb_top", *(f"-G{name}={value}" for name, value in parameters.items())]
@@ -72,9 +74,9 @@ def build_top(headers: Mapping[str, str], parameters: Mapping[str, int], harness
 def _shared_library(folder: Path, tool: Tool, files: Mapping[str, str], flags: list[str], harness: str) -> Path:
     _verilate(folder, tool, files, flags)
     made = [str(path) for path in sorted((folder / "made").glob("*.cpp"))]
-    runtime = [str(_verilated_object(tool, False, name)) for name in _RUNTIME]
+    runtime = [str(_verilated_object(tool, None, name)) for name in _RUNTIME]
     # -O1: such a simulator runs a few frames at most; compilation is most of its time.
-    options = [*_verilated_options(tool, False), "-O1", "-Imade", "-fPIC", "-shared", *made, harness, *runtime]
+    options = [*_verilated_options(tool, None), "-O1", "-Imade", "-fPIC", "-shared", *made, harness, *runtime]
     run([*compiler(), *_CXX, *options, "-o", "simulator.so"], folder, "the C++ compiler")
     return folder / "simulator.so"
 
@@ -100,11 +102,14 @@ def _units(files: Mapping[str, str]) -> list[str]:
     return [name for name in files if name.endswith(".sv")]
 
 
-def _with_verilator(folder: Path, tool: Tool, files: Mapping[str, str], trace: bool) -> Path:
-    _verilate(folder, tool, files, ["--top-module", TOP, *(["--trace"] if trace else [])])
+def _with_verilator(folder: Path, tool: Tool, files: Mapping[str, str], trace: Trace | None) -> Path:
+    _verilate(folder, tool, files, ["--top-module", TOP, *([f"--trace-{trace}"] if trace else [])])
     options = [*_verilated_options(tool, trace), "-Imade"]
     made = [str(path) for path in sorted((folder / "made").glob("*.cpp"))]
-    runtime = [str(_verilated_object(tool, trace, name)) for name in (*_RUNTIME, *(_TRACE if trace else ()))]
+    runtime = [
+        str(_verilated_object(tool, trace, name))
+        for name in (*_RUNTIME, *([f"verilated_{trace}_c.cpp"] if trace else []))
+    ]
     return _compile(folder, [*options, *made], runtime)
 
 
@@ -115,14 +120,15 @@ def _verilate(folder: Path, tool: Tool, files: Mapping[str, str], more: list[str
     run(command, folder, tool.name, tool.environment())
 
 
-def _verilated_options(tool: Tool, trace: bool) -> list[str]:
+def _verilated_options(tool: Tool, trace: Trace | None) -> list[str]:
     assert tool.root is not None
     include = tool.root / "include"
-    defines = [f"-DVM_TRACE={int(trace)}", f"-DVM_TRACE_VCD={int(trace)}", "-DVM_COVERAGE=0", "-DVM_SC=0"]
+    traces = {"VM_TRACE": trace is not None, "VM_TRACE_VCD": trace == "vcd", "VM_TRACE_SAIF": trace == "saif"}
+    defines = ["-DVM_COVERAGE=0", "-DVM_SC=0", *(f"-D{name}={int(value)}" for name, value in traces.items())]
     return [*defines, f"-I{include}", f"-I{include / 'vltstd'}"]
 
 
-def _verilated_object(tool: Tool, trace: bool, name: str) -> Path:
+def _verilated_object(tool: Tool, trace: Trace | None, name: str) -> Path:
     """Verilator's runtime is the same for every core, and takes longer to compile than most."""
     assert tool.root is not None
     source = str(tool.root / "include" / name)
@@ -135,7 +141,7 @@ def _verilated_object(tool: Tool, trace: bool, name: str) -> Path:
     return _kept(("runtime, -fPIC", name, trace, tool.version(), compiler()), make, {})
 
 
-def _with_yosys(folder: Path, tool: Tool, files: Mapping[str, str], trace: bool) -> Path:
+def _with_yosys(folder: Path, tool: Tool, files: Mapping[str, str], trace: Trace | None) -> Path:
     assert tool.root is not None
     assert not trace
     script = (

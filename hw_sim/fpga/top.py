@@ -76,7 +76,9 @@ class Top:
     def read_at(self, address: int) -> int:
         """Raises RegisterError where the core refuses."""
         value = ctypes.c_uint32()
-        self._answered(self.library.upb_sim_access_read(self.handle, address, ctypes.byref(value)), f"read of {address:#x}")
+        self._answered(
+            self.library.upb_sim_access_read(self.handle, address, ctypes.byref(value)), f"read of {address:#x}"
+        )
         return value.value
 
     def write_at(self, address: int, value: int, strobe: int = 15) -> None:

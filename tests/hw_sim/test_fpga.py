@@ -332,14 +332,14 @@ def test_a_built_core_is_kept(monkeypatch, tmp_path):
 
 
 def test_a_vcd_on_request(model, rng, tmp_path):
-    core = RtlCore(shipped(), "int8", trace=True)
+    core = RtlCore(shipped(), "int8", trace="vcd")
     image = random_image(rng, model.rules, 4)
-    core.run(image_beats(*image, 4), 4, vcd=tmp_path / "core.vcd")
+    core.run(image_beats(*image, 4), 4, trace=tmp_path / "core.vcd")
     text = (tmp_path / "core.vcd").read_text()
     assert "$enddefinitions" in text
     assert "m_axis_tdata" in text
     with pytest.raises(ValueError, match="without trace"):
-        RtlCore(shipped(), "int8").run(image_beats(*image, 4), 4, vcd=tmp_path / "no.vcd")
+        RtlCore(shipped(), "int8").run(image_beats(*image, 4), 4, trace=tmp_path / "no.vcd")
 
 
 def test_the_backend_of_the_upsampler(model, rng):

@@ -95,7 +95,12 @@ def retrained(name: str) -> Source:
 
     def other(n):
         return replace(
-            n, weight=n.weight[::-1] // 2, output=-n.output, minimum=n.minimum // 2, bias=n.bias // 3, offset=n.offset // 2
+            n,
+            weight=n.weight[::-1] // 2,
+            output=-n.output,
+            minimum=n.minimum // 2,
+            bias=n.bias // 3,
+            offset=n.offset // 2,
         )
 
     networks = source.file.integer(precision)
