@@ -116,7 +116,7 @@ def sweep(
             luts, clock, label = _routed(found[0]) if found else _fitted(part, c, fit, ours)
             if clock is None or (luts > LUT_LIMIT * there.figure("fpga.luts").get("1") and not found):
                 continue
-            cycles = CoreCycles(c, precision, source.file.rules)
+            cycles = CoreCycles.of(c, precision, source.file.rules)
             mac = there.figure("power.mac_energy").span("J/MAC")
             idle = there.figure("power.idle").span("W")
             fps = cycles.frames_per_second(clock[0] * 1e6, columns)

@@ -38,7 +38,14 @@ class CoreCycles:
 
     configuration: Configuration
     precision: Precision
-    rules: Rules
+    fill: bool = True
+    """the rule for empty pixels"""
+    seam: bool = True
+    """the rule for edges"""
+
+    @classmethod
+    def of(cls, configuration: Configuration, precision: Precision, rules: Rules) -> CoreCycles:
+        return cls(configuration, precision, rules.empty == "fill", rules.edge == "seam")
 
     @property
     def interval(self) -> int:
@@ -57,7 +64,7 @@ class CoreCycles:
     @property
     def pipeline(self) -> int:
         """Clocks from the slot of a beat to its output beat in the FIFO."""
-        fill = FILL_STAGES if self.rules.empty == "fill" else 0
+        fill = FILL_STAGES if self.fill else 0
         code = CODE_STAGES if self.precision == "int8" else 0
         return WINDOW_STAGES + fill + MINIMUM_STAGES + code + self.network + OUTPUT_STAGES
 
@@ -96,7 +103,7 @@ class CoreCycles:
 
     def stream(self, frames: int, columns: int) -> int:
         """First beat accepted to last beat given, both included, of ``frames`` frames and an edge after the last."""
-        edges = frames if self.rules.edge == "zero" else 1
+        edges = 1 if self.seam else frames
         slots = BEAMS * (frames * columns + edges) + 1  # one more: beat 31 follows its column's last window
         return self.first_slot - FIRST_ACCEPTED + (slots - 1) * self.interval + self.beat + 1
 
@@ -106,7 +113,7 @@ class CoreCycles:
 
     def frames_per_second(self, clock_hz: float, columns: int) -> float:
         """Sustained."""
-        edges = 1 if self.rules.edge == "zero" else 0
+        edges = 0 if self.seam else 1
         return clock_hz / (BEAMS * (columns + edges) * self.interval)
 
     # ----------------------------------------------------------------------------------------- back-pressure

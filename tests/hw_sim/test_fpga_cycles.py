@@ -37,7 +37,7 @@ COLUMNS = 24
 def swept():
     made = build_all({name: (make(), precision, more) for name, (make, precision, more) in SWEPT.items()})
     rules = {name: make().file.rules for name, (make, _, _) in SWEPT.items()}
-    models = {n: CoreCycles(core.configuration, SWEPT[n][1], rules[n]) for n, core in made.items()}
+    models = {n: CoreCycles.of(core.configuration, SWEPT[n][1], rules[n]) for n, core in made.items()}
     return {name: (core, models[name], rules[name]) for name, core in made.items()}
 
 
@@ -90,7 +90,7 @@ def test_one_window_a_clock():
     source = shipped()
     for precision, latency in (("int8", 30), ("int16", 27)):
         c = configuration(source.file.integer(precision), fold=1)
-        cycles = CoreCycles(c, precision, source.file.rules)
+        cycles = CoreCycles.of(c, precision, source.file.rules)
         assert cycles.column_latency == latency
         assert cycles.frame(2048) <= 65_536 * 1.01 + 200
         assert cycles.column == 32
@@ -98,5 +98,5 @@ def test_one_window_a_clock():
 
 def test_frames_per_second():
     source = shipped()
-    cycles = CoreCycles(configuration(source.file.int8, fold=12), "int8", source.file.rules)
+    cycles = CoreCycles.of(configuration(source.file.int8, fold=12), "int8", source.file.rules)
     assert cycles.frames_per_second(100e6, 2048) == pytest.approx(100e6 / (65_536 * 12))
