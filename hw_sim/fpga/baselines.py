@@ -49,7 +49,7 @@ BUILDS = (
     Build("hdl-64e", "int8", "ecp5-25", 12, seeds=MANY),
     Build("hdl-64e", "int8", "ice40up5k", 24, seeds=MANY),
     Build("hdl-64e", "int8", "ecp5-12", 12, seeds=MANY),
-    Build("hdl-64e", "int8", "ecp5-25", 1),
+    Build("hdl-64e", "int8", "ecp5-25", 1, seeds=ONE),
     Build("hdl-64e", "int16", "ecp5-25", 12),
     Build("hdl-64e", "int8", "ecp5-25", 24, seeds=ONE),
     Build("hdl-64e", "int8", "ecp5-25", 48, seeds=ONE),

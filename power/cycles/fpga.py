@@ -73,8 +73,9 @@ class FpgaCore:
 
 
 def smallest_core(multipliers: int, hidden: int, share: float = 0.8) -> FpgaCore:
-    """One lane, both networks, with the least ``fold`` above 1 whose multipliers fit in ``share`` of those there are, or
-    in the eight of the smallest parts. Raises FpgaCoreError where not even one multiplier is free for each network."""
+    """One lane, both networks, with the least ``fold`` above 1 whose multipliers fit in ``share`` of those there are,
+    or in the eight of the smallest parts. Raises FpgaCoreError where not even one multiplier is free for each
+    network."""
     usable = max(min(multipliers, 8), int(multipliers * share))
     for fold in (f for f in folds(hidden) if f > 1):
         core = FpgaCore(1, fold, hidden)
