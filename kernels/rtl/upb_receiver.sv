@@ -133,4 +133,32 @@ module upb_receiver #(
             beat <= 1'b0;
         end
     end
+`ifdef FORMAL
+    reg past, slot1;
+    reg [4:0] sent;  // beats that left, modulo 32
+    wire leaves = slot1 && beat;
+    wire [4:0] underway = sent + leaves;
+    initial past = 0;
+    always @(posedge clk) begin
+        past <= 1'b1;
+        assume (past || rst);
+        slot1 <= slot && !rst;
+        sent <= rst ? 5'd0 : underway;
+        if (past && !rst && $past(!rst)) begin
+            // Beams leave in order and columns are whole: between two columns nothing is lost or repeated.
+            if (leaves) beams_in_order: assert (beam == sent);
+            none_lost: assert (next_beam == underway);
+            between_columns: assert (state != SYNC || next_beam == 5'd0);
+            no_beat_without_room: assert (!$past(slot && !room) || !beat);
+            no_ready_without_room: assert (!in_ready || (slot && room && in_valid));
+            mark_is_a_columns: assert (!marked || state == PAD || state == SYNC || (state == RUN && !top));
+            if (beat && !real_) edge_is_empty: assert (data == 24'd0 && !padded);
+            // What is refused is told.
+            if ($past(in_valid && in_ready) && !$past(take)) dropped_is_told: assert (ev_dropped);
+            if ($past(take && in_data[24] && next_beam != 5'd31)) short_is_told: assert (ev_short_column);
+            if ($past(take && !in_data[24] && next_beam == 5'd31)) long_is_told: assert (ev_long_column);
+            if ($past(take && next_beam == 5'd31)) column_is_counted: assert (ev_column);
+        end
+    end
+`endif
 endmodule

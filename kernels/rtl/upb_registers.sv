@@ -348,4 +348,38 @@ module upb_registers #(
             end
         endcase
     end
+`ifdef FORMAL
+    reg past;
+    reg [RESET_BITS:0] enabled_for;
+    initial past = 0;
+    always @(posedge clk) begin
+        past <= 1'b1;
+        assume (past || rst);
+        if (rst || !enable) enabled_for <= 0;
+        else if (!enabled_for[RESET_BITS]) enabled_for <= enabled_for + 1'b1;
+        if (past && !rst && $past(!rst)) begin
+            long_reset: assert (!running || enabled_for[RESET_BITS] || !enable);
+            reset_counts: assert (enabled_for == reset_count);
+            stops_at_once: assert (!running || $past(enable));
+            // A flag stays until 1 is written to it, and one that comes at the same clock is not lost.
+            flags_stay: assert ((events & $past(events & ~cleared)) == $past(events & ~cleared));
+            flags_come: assert ((events & $past(set)) == $past(set));
+            flags_only_so: assert ((events & ~$past(events | set)) == 0);
+            interrupt: assert (irq == $past(|(events & irq_enable)));
+            if (!$past(clear)) begin
+                counts_dropped: assert (dropped == $past(dropped) + $past(ev_dropped));
+                counts_columns: assert (columns_out == $past(columns_out) + $past(out_beat && out_last));
+                counts_errors: assert (errors == $past(errors) + $past(error));
+                counts_misses: assert (misses == $past(misses) + $past(set[EVENTS_DEADLINE]));
+            end else clears: assert (dropped == 0 && columns_out == 0 && errors == 0 && misses == 0);
+            if ($past(running && watching && deadline != 0 && timer == deadline && !rst)) deadline_told: assert (events[EVENTS_DEADLINE]);
+            columns_fixed: assert (columns == $past(columns) || $past(!enable && put));
+            columns_within: assert (columns >= 16'd4);
+            bank_with_swap: assert (bank == $past(bank) || $past(ev_swapped));
+            swap_waits: assert (!$past(swap && !ev_swapped) || swap);
+            no_write_while_waiting: assert (!$past(swap) || !weights[44]);
+            sound_swap: assert (!swap || $past(swap) || ($past(written == length && weights_sum == expected)));
+        end
+    end
+`endif
 endmodule

@@ -38,4 +38,35 @@ module upb_skid #(
             extra <= !free && (extra || accepted);
         end
     end
+`ifdef FORMAL
+    // Any one beat is followed through (numbers modulo 16): what went in comes out, in order, once.
+    (* anyconst *) reg [3:0] watched;
+    reg [3:0] taken, given;
+    reg [WIDTH-1:0] kept;
+    reg past;
+    initial {past, taken, given} = 0;
+    wire [3:0] place = watched - given;
+    wire inside = place < (taken - given);
+    always @(posedge clk) begin
+        past <= 1'b1;
+        if (rst) {taken, given} <= 0;
+        else begin
+            taken <= taken + accepted;
+            given <= given + (out_valid && out_ready);
+        end
+        if (accepted && taken == watched) kept <= in_data;
+        assume (past || rst);
+        if (past) begin
+            counted: assert (taken - given == {3'd0, full} + {3'd0, extra});
+            spare_behind_head: assert (!extra || full);
+            if (inside) in_order: assert ((place == 4'd0 ? head : spare) == kept);
+            if (!rst && $past(!rst && out_valid && !out_ready)) begin
+                valid_holds: assert (out_valid);
+                data_holds: assert ($stable(out_data));
+            end
+            if ($past(rst)) reset_quiet: assert (!in_ready && !out_valid);
+            if (!rst && $past(awake && !extra && !rst) && $past(!in_valid)) ready_holds: assert (in_ready);
+        end
+    end
+`endif
 endmodule

