@@ -32,12 +32,15 @@ class Check:
     parameters: Mapping[str, str] = field(default_factory=dict)
 
 
+# Three columns; beam 31 waits two of them, beam 30 one, the others none.
+_RING = {"SLOTS": "3", "DELAY": "1", "LAG": f"512'h00020001{0:0120x}"}
+
 CHECKS: dict[str, Check] = {
     "axil": Check("upb_axil", ("upb_axil.sv",), 3, {"ADDRESS": "4"}),
     "skid": Check("upb_skid", ("upb_skid.sv",), 3, {"WIDTH": "4"}),
-    "fifo": Check("upb_fifo", ("upb_check.svh", "upb_fifo.sv"), 3, {"WIDTH": "2", "DEPTH": "16", "SLACK": "7"}),
+    "fifo": Check("upb_fifo", ("upb_check.svh", "upb_fifo.sv"), 3, {"WIDTH": "2", "DEPTH": "8", "SLACK": "4"}),
     "receiver": Check("upb_receiver", ("upb_receiver.sv",), 3),
-    "destagger": Check("upb_destagger", ("upb_check.svh", "upb_skid.sv", "upb_destagger.sv"), 3, {"SLOTS": "2", "DELAY": "1"}),
+    "destagger": Check("upb_destagger", ("upb_check.svh", "upb_skid.sv", "upb_destagger.sv"), 3, _RING),
     "registers": Check("upb_registers", ("upb_regs.svh", "upb_axil.sv", "upb_registers.sv"), 3, {"WRITABLE": "1"}),
 }
 

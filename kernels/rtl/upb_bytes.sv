@@ -19,26 +19,14 @@ module upb_bytes (
     output wire [1:0] out_user,
     output reg        error          // since reset: something did not fit, or was lost
 );
-    // ------------------------------------------------------------------ three bytes to a beat
-    reg  [ 1:0] have;                // bytes at hand; 3: a beat is offered
-    reg  [23:0] word;
-    reg         word_last;
-    reg  [ 1:0] word_user;
-    reg         awake;
-    wire        beat_ready;
-    assign in_ready = awake && have != 2'd3;
-    always @(posedge clk) begin
-        awake <= resetn;
-        if (!resetn) have <= 2'd0;
-        else if (have == 2'd3) begin
-            if (beat_ready) have <= 2'd0;
-        end else if (in_valid && in_ready) begin
-            have <= have + 2'd1;
-            word <= {in_data, word[23:8]};
-            word_last <= in_last;
-            word_user <= in_user;
-        end
-    end
+    wire [23:0] word;
+    wire word_valid, word_ready, word_last;
+    wire [1:0] word_user;
+    upb_bytes_in to_beats (
+        .clk(clk), .resetn(resetn),
+        .in_data(in_data), .in_valid(in_valid), .in_ready(in_ready), .in_last(in_last), .in_user(in_user),
+        .beat(word), .beat_valid(word_valid), .beat_ready(word_ready), .beat_last(word_last), .beat_user(word_user)
+    );
 
     wire [47:0] beat;
     wire beat_valid, beat_taken, beat_last;
@@ -46,7 +34,7 @@ module upb_bytes (
     wire [7:0] events;
     upb_core core (
         .aclk(clk), .aresetn(resetn), .cfg_columns(upb_pkg::UPB_COLUMNS[15:0]),
-        .s_axis_tdata(word), .s_axis_tvalid(have == 2'd3), .s_axis_tready(beat_ready),
+        .s_axis_tdata(word), .s_axis_tvalid(word_valid), .s_axis_tready(word_ready),
         .s_axis_tlast(word_last), .s_axis_tuser(word_user),
         .m_axis_tdata(beat), .m_axis_tvalid(beat_valid), .m_axis_tready(beat_taken),
         .m_axis_tlast(beat_last), .m_axis_tuser(beat_user),
@@ -58,25 +46,9 @@ module upb_bytes (
         if (!resetn) error <= 1'b0;
         else if (|events[7:2]) error <= 1'b1;
 
-    // ------------------------------------------------------------------ a beat to six bytes
-    reg [ 2:0] left;                 // bytes still to give
-    reg [47:0] rest;
-    reg        rest_last;
-    reg [ 1:0] rest_user;
-    assign beat_taken = left == 3'd0;
-    assign out_data = rest[7:0];
-    assign out_valid = left != 3'd0;
-    assign out_last = rest_last && left == 3'd1;
-    assign out_user = rest_user;
-    always @(posedge clk)
-        if (!resetn) left <= 3'd0;
-        else if (left == 3'd0) begin
-            if (beat_valid) left <= 3'd6;
-            rest <= beat;
-            rest_last <= beat_last;
-            rest_user <= beat_user;
-        end else if (out_ready) begin
-            left <= left - 3'd1;
-            rest <= {8'd0, rest[47:8]};
-        end
+    upb_bytes_out to_bytes (
+        .clk(clk), .resetn(resetn),
+        .beat(beat), .beat_valid(beat_valid), .beat_ready(beat_taken), .beat_last(beat_last), .beat_user(beat_user),
+        .out_data(out_data), .out_valid(out_valid), .out_ready(out_ready), .out_last(out_last), .out_user(out_user)
+    );
 endmodule
