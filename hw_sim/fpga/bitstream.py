@@ -79,7 +79,9 @@ def build_bitstream(
         "model_crc32": f"{source.crc32:08x}", "precision": precision, "fold": c.fold, "lanes": c.lanes, **parameters,
     }  # fmt: skip
     synthesised = made.step(
-        "synthesise", (sorted(files.items()), parameters, yosys.version()), lambda: _synthesise(folder, files, parameters, yosys)
+        "synthesise",
+        (sorted(files.items()), parameters, yosys.version()),
+        lambda: _synthesise(folder, files, parameters, yosys),
     )
     routed = made.step(
         "route", (synthesised["key"], board, seed, router.version()), lambda: _route(folder, board, seed, router)

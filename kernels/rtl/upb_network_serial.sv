@@ -138,13 +138,19 @@ module upb_network_serial #(
     // ------------------------------------------------------------------ clocks 4 and 5: the sum of W * e
     localparam integer EXACT = 16 + WBITS + 3;  // bits that hold six products
     localparam integer SUM = EXACT < 32 ? EXACT : 32;
-    reg signed [SUM-1:0] part, part4, sum5;
-    integer n3;
-    always @* begin
-        part = {SUM{1'b0}};
-        for (n3 = 0; n3 < MULTIPLIERS; n3 = n3 + 1)
-            if (phase3 * MULTIPLIERS + n3 < 6) part = part + $signed(product3[n3*PB +: PB]);
-    end
+    reg signed [SUM-1:0] part4, sum5;
+    wire signed [4*SUM-1:0] counted;  // those of W, as a tree of four
+    generate
+        for (genvar n = 0; n < 4; n = n + 1) begin : of_w
+            if (n < MULTIPLIERS) begin : there
+                wire signed [SUM-1:0] wide = $signed(product3[n*PB +: PB]);
+                assign counted[n*SUM +: SUM] = phase3 * MULTIPLIERS + n < 6 ? wide : {SUM{1'b0}};
+            end else begin : not_there
+                assign counted[n*SUM +: SUM] = {SUM{1'b0}};
+            end
+        end
+    endgenerate
+    wire [SUM-1:0] part = (counted[0 +: SUM] + counted[SUM +: SUM]) + (counted[2*SUM +: SUM] + counted[3*SUM +: SUM]);
 
     wire [31:0] b3;
     wire [BITS-1:0] at2;
