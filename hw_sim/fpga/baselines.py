@@ -1,6 +1,7 @@
 """Resources and clocks of the shipped models' cores, kept in the repository; ``make fpga`` renews them (half an hour).
 
-python -m upbeam.hw_sim.fpga.baselines FOLDER [NAME ...]
+    python -m upbeam.hw_sim.fpga.baselines FOLDER [NAME ...]    renews
+    python -m upbeam.hw_sim.fpga.baselines --table              the table of docs/fpga.md
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from upbeam.quant.integer import Precision
 
 from .flow import run_flow
 
-__all__ = ["BUILDS", "QUICK", "Build", "baselines", "build", "renew"]
+__all__ = ["BUILDS", "QUICK", "Build", "baselines", "build", "markdown_table", "renew"]
 
 FILE = "baselines.json"
 _LEFT_OUT = ("step", "key", "seconds")
@@ -90,11 +91,39 @@ def renew(builds: Sequence[Build], folder: Path, file: Path, say: Callable[[str]
         file.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
 
 
+def markdown_table(reports: Mapping[str, Mapping[str, Any]]) -> str:
+    """As docs/fpga.md has it."""
+    head = "| core | part | LUTs | FFs | multipliers | clock, MHz | margin |"
+    return "\n".join([head, "| --- " * 7 + "|", *(_table_row(report) for report in reports.values())])
+
+
+def _table_row(r: Mapping[str, Any]) -> str:
+    lanes = f", LANES {r['lanes']}" if r["lanes"] > 1 else ""
+    used = r.get("utilisation", {})
+    counts = []
+    for name in ("luts", "ffs", "multipliers"):
+        if name in used:
+            share = 100 * used[name]["used"] / used[name]["available"]
+            counts.append(f"{used[name]['used']:,} ({share:.0f} %)")
+        else:
+            counts.append(f"{r['resources'][name]:,}")
+    clock, margin = r["label"], "-"
+    if "clock_mhz" in r:
+        c = r["clock_mhz"]
+        spread = f"{c['least']:.1f} to {c['most']:.1f}, {c['seeds']} seeds" if c["seeds"] > 1 else "1 seed"
+        clock, margin = f"{c['median']:.1f} ({spread})", f"{r['margin']:.1f}"
+    cells = [f"{r['model']}, {r['precision']}, FOLD {r['fold']}{lanes}", r["part"], *counts, clock, margin]
+    return f"| {' | '.join(cells)} |"
+
+
 def _say_step(say: Callable[[str], None], name: str, step: str, kept: bool) -> None:
     say(f"{name}: {step}{' (kept)' if kept else ''}")
 
 
 def _main(arguments: Sequence[str]) -> None:
+    if list(arguments) == ["--table"]:
+        print(markdown_table(baselines()))
+        return
     folder, names = Path(arguments[0]), arguments[1:]
     chosen = [one for one in BUILDS if not names or one.name in names]
     renew(chosen, folder, Path(__file__).with_name(FILE))

@@ -109,7 +109,7 @@ PARTS: dict[str, Part] = {
 # ------------------------------------------------------------------------------------------------------- the steps
 
 
-class _Folder:
+class StepFolder:
     """Results by step name; a result counts as long as the key it was made for is the same."""
 
     def __init__(self, path: Path, on_step: Callable[[str, bool], None]) -> None:
@@ -158,7 +158,7 @@ def run_flow(
     Raises FlowError, ConfigurationError, ExportError and ToolError."""
     if part_name not in PARTS:
         raise FlowError(f"part {part_name!r} is unknown, expected one of: {', '.join(PARTS)}")
-    part, made = PARTS[part_name], _Folder(folder, on_step)
+    part, made = PARTS[part_name], StepFolder(folder, on_step)
     headers = core_headers(source, precision, fold=fold, lanes=lanes)
     c = configuration(source.integer(precision), fold=fold, lanes=lanes)
     files = {**sources(), **headers}

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from upbeam.hw_sim.fpga import ToolError, flow
-from upbeam.hw_sim.fpga.baselines import BUILDS, QUICK, Build, baselines, build, renew
+from upbeam.hw_sim.fpga.baselines import BUILDS, QUICK, Build, baselines, build, markdown_table, renew
 from upbeam.hw_sim.fpga.flow import FlowError, compare, run_flow
 from upbeam.hw_sim.fpga.tools import Tool
 
@@ -149,6 +149,11 @@ def test_every_build_has_a_baseline():
         assert (report["fold"], report["lanes"]) == (one.fold, one.lanes)
         assert report["date"] >= "2026-11-22"
         assert "Yosys" in report["tools"]["synthesis"]
+
+
+def test_the_table_in_the_documentation_is_of_the_baselines():
+    text = (Path(__file__).resolve().parents[2] / "docs" / "fpga.md").read_text()
+    assert markdown_table(baselines()) in text
 
 
 def test_goals_are_met_as_routed():
