@@ -156,9 +156,11 @@ def _routed(report: Mapping[str, Any]) -> tuple[int, Clock, str]:
 def _fitted(
     part: str, c: Configuration, fit: Sequence[float], ours: Sequence[Mapping[str, Any]]
 ) -> tuple[int, Clock | None, str]:
-    """ECP5 with multipliers only: shifts and adds, and other families, are known as routed or not at all."""
+    """ECP5 with multipliers only, and lanes of whole hidden units: what shares multipliers within several lanes, shifts
+    and adds, and other families, are known as routed or not at all."""
     alike = [r["clock_mhz"] for r in ours if r["part"].startswith("ecp5") and r["fold"] > 1]
-    if not part.startswith("ecp5") or c.fold == 1 or not alike:
+    unlike = c.fold == 1 or (c.phases > 1 and c.lanes > 1)
+    if not part.startswith("ecp5") or unlike or not alike:
         return 0, None, FITTED
     luts = float(np.dot(fit, _terms(c)))
     clock = (
@@ -169,9 +171,9 @@ def _fitted(
     return round(luts), clock, FITTED
 
 
-def _terms(c: Configuration) -> tuple[float, float, float]:
-    """What LUTs grow with: what surrounds the networks, lanes, multipliers."""
-    return 1.0, float(c.lanes), float(_multipliers(c))
+def _terms(c: Configuration) -> tuple[float, float]:
+    """What LUTs grow with: what surrounds the networks, and multipliers with their sums."""
+    return 1.0, float(_multipliers(c))
 
 
 def _fit(ours: Sequence[Mapping[str, Any]], source: Source, precision: Precision) -> tuple[list[float], float]:
