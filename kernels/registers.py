@@ -16,7 +16,17 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["Field", "Register", "RegisterMap", "RegisterMapError", "c_header", "main", "outputs", "read_map", "sv_header"]
+__all__ = [
+    "Field",
+    "Register",
+    "RegisterMap",
+    "RegisterMapError",
+    "c_header",
+    "main",
+    "outputs",
+    "read_map",
+    "sv_header",
+]
 
 ACCESS = ("ro", "rw", "w1c", "wo")
 _HERE = Path(__file__).resolve().parent
@@ -103,7 +113,9 @@ def _check(m: RegisterMap) -> None:
         taken = 0
         for f in r.fields:
             if f.bits < 1 or f.low + f.bits > 32 or taken & f.mask:
-                raise RegisterMapError(f"{r.name}.{f.name}: bits {f.low} to {f.low + f.bits - 1} are taken or not there")
+                raise RegisterMapError(
+                    f"{r.name}.{f.name}: bits {f.low} to {f.low + f.bits - 1} are taken or not there"
+                )
             taken |= f.mask
     if len({r.name for r in m.registers}) != len(m.registers):
         raise RegisterMapError("a name stands twice")
@@ -177,7 +189,8 @@ def table(m: RegisterMap) -> str:
         lines.append(f"| {r.address:#05x} | `{r.name}` | {r.access} | {reset} | {r.text} |")
         lines += [f"| | {_bits(f)} `{f.name}` | | | {f.text} |" for f in r.fields]
     lines.append(
-        f"| {m.weights:#06x} to {m.weights + m.weights_bytes - 4:#06x} | weights | wo | | see below; SLVERR without WRITABLE |"
+        f"| {m.weights:#06x} to {m.weights + m.weights_bytes - 4:#06x} | weights | wo | | see below; SLVERR where they "
+        "cannot be written |"
     )
     return "\n".join([*lines, END])
 

@@ -1,5 +1,5 @@
-"""A board's bitstream: ``upb_top`` between the pins of a board, synthesised, placed, routed and packed. Built, not run on a
-board. Steps and their artefacts are those of ``flow``."""
+"""A board's bitstream: ``upb_top`` between the pins of a board, synthesised, placed, routed and packed. Built, not
+run on a board. Steps and their artefacts are those of ``flow``."""
 
 from __future__ import annotations
 

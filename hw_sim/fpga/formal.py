@@ -1,8 +1,8 @@
 """Properties of the core's modules, proved for all inputs and all time: ``python -m upbeam.hw_sim.fpga.formal``.
 
-The assertions stand inside the modules (under ``FORMAL``), since Yosys makes free wires of references into others. Each check
-is a proof by induction with SymbiYosys and Z3; what is proved is proved for the small parameters named here. docs/fpga-formal.md
-lists the properties."""
+The assertions stand inside the modules (under ``FORMAL``), since Yosys makes free wires of references into others.
+Each check is a proof by induction with SymbiYosys and Z3; what is proved is proved for the small parameters named here.
+docs/fpga-formal.md lists the properties."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ class Proof:
 
 
 def prove(check: Check, *, bounded: int | None = None, changed: Mapping[str, str] | None = None) -> Proof:
-    """``bounded``: looks for a counterexample of so many clocks instead of a proof. ``changed``: other text of some of the
-    files. Raises ToolError where the tools are missing or cannot read the sources."""
+    """``bounded``: looks for a counterexample of so many clocks instead of a proof. ``changed``: other text of some of
+    the files. Raises ToolError where the tools are missing or cannot read the sources."""
     files = {**{name: text for name, text in sources().items() if name in check.files}, **(changed or {})}
     with tempfile.TemporaryDirectory(prefix="upbeam-formal-") as scratch:
         folder = Path(scratch)

@@ -61,12 +61,20 @@ def build(headers: Mapping[str, str], simulator: Simulator = "verilator", *, tra
     return _kept(key, lambda folder: maker(folder, tool, files, trace), files)
 
 
-def build_top(headers: Mapping[str, str], parameters: Mapping[str, int], harness: str, text: str) -> Path:
-    """``upb_top`` with these parameters and a C++ harness around it, as a shared library (Verilator). Raises
-    ToolError."""
+def build_top(
+    headers: Mapping[str, str],
+    parameters: Mapping[str, int],
+    harness: str,
+    text: str,
+    *,
+    top: str = "upb_top",
+    more: Mapping[str, str] | None = None,
+) -> Path:
+    """``top`` with these parameters and a C++ harness (its file name and text) around it, as a shared library
+    (Verilator). ``more``: sources beside the core's. Raises ToolError."""
     tool = find_verilator()
-    files = {**sources(), **headers, harness: text}
-    flags = ["--top-module", "upb_top", *(f"-G{name}={value}" for name, value in parameters.items())]
+    files = {**sources(), **headers, **(more or {}), harness: text}
+    flags = ["--top-module", top, *(f"-G{name}={value}" for name, value in parameters.items())]
     key = (sorted(files.items()), flags, tool.version(), compiler())
     return _kept(key, lambda folder: _shared_library(folder, tool, files, flags, harness), files)
 

@@ -1,5 +1,5 @@
-"""The destagger ring of a model's beam table, for ``kernels/rtl/upb_destagger.sv``; planned as ``runtime/src/upb_stream.c``
-does."""
+"""The destagger ring of a model's beam table, for ``kernels/rtl/upb_destagger.sv``; planned as in
+``runtime/src/upb_stream.c``."""
 
 from __future__ import annotations
 

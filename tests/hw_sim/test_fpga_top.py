@@ -1,12 +1,11 @@
-"""The top around the FPGA core: registers over AXI4-Lite, times, deadline and interrupt, errors, weights that are swapped, and
-the C driver that uses them; the destagger ring against the C stream."""
+"""The top around the FPGA core: registers over AXI4-Lite, times, deadline and interrupt, errors, weights that are swapped,
+and the C driver that uses them; the destagger ring against the C stream."""
 
 from __future__ import annotations
 
 import ctypes
 import errno
 import importlib.util
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 
 from upbeam.hw_sim.fpga import ToolError
-from upbeam.hw_sim.fpga.beats import ENDS, LAST, STARTS, column_beats, image_beats, output_columns
+from upbeam.hw_sim.fpga.beats import ENDS, LAST, STARTS, column_beats, image_beats
 from upbeam.hw_sim.fpga.top import RegisterError, Top, library
 from upbeam.kernels import registers
 from upbeam.quant.export.rtl import core_headers
@@ -725,12 +724,12 @@ def test_uio_maps_registers_and_waits(driver_library, tmp_path):
     [
         ("hdl-64e", {}, {"DESTAGGER": 1}, None, "all lasers of this model's beam table share their azimuth"),
         ("hdl-64e", {"fold": 1}, {"WRITABLE": 1}, None, "WRITABLE needs FOLD > 1"),
-        ("hdl-64e", {"fold": 24, "lanes": 2}, {"WRITABLE": 1}, None, "WRITABLE with FOLD beyond the hidden units needs LANES 1"),
+        ("hdl-64e", {"fold": 24, "lanes": 2}, {"WRITABLE": 1}, None, "beyond the hidden units needs LANES 1"),
         ("hdl-64e", {}, {"WRITABLE": 2}, None, "WRITABLE must be 0 or 1"),
         ("hdl-64e", {}, {"DESTAGGER": -1}, None, "DESTAGGER must be 0 or 1"),
         ("hdl-64e", {}, {}, ("UPB_BEAMS_CRC32 = 32'h", "UPB_BEAMS_CRC32 = ~32'h"), "are of different models"),
-        ("vlp-32c", {}, {"DESTAGGER": 1}, ("UPB_RING_DELAY = 11", "UPB_RING_DELAY = 0"), "azimuth offsets on both sides of 0"),
-        ("vlp-32c", {}, {"DESTAGGER": 1}, ("UPB_RING_SLOTS = 23", "UPB_RING_SLOTS = 24"), "largest lag must be SLOTS - 1"),
+        ("vlp-32c", {}, {"DESTAGGER": 1}, ("RING_DELAY = 11", "RING_DELAY = 0"), "offsets on both sides of 0"),
+        ("vlp-32c", {}, {"DESTAGGER": 1}, ("RING_SLOTS = 23", "RING_SLOTS = 24"), "largest lag must be SLOTS - 1"),
     ],
 )  # fmt: skip
 def test_a_wrong_parameter_stops_elaboration(model, options, parameters, edit, problem):
