@@ -140,7 +140,7 @@ MUTANTS = [
     ),
     (
         "destagger",
-        9,
+        11,
         [
             ("waiting <= DELAY;", "waiting <= 0;"),
             ("state <= PAD;", "state <= SYNC;"),
@@ -160,13 +160,15 @@ MUTANTS = [
     ),
     (
         "registers",
-        8,
+        5,
         [
-            ("running <= enable && reset_count[RESET_BITS];", "running <= write_data[0];"),
-            ("enable <= 1'b0;", "enable <= 1'b1;"),
-            ("irq_enable <= 0;", "irq_enable <= 1;"),
+            ("running <= enable && reset_count[RESET_BITS];", "running <= ev_column;"),
+            ("enable <= 1'b0;", "enable <= ev_frame;"),
             ("else if (!reset_count[RESET_BITS]) reset_count", "else reset_count"),
-            ("events <= (events & ~cleared) | set;", "events <= (events | {set[9:0], set[10]}) & ~irq_enable;"),
+            (
+                "events <= (events & ~cleared) | set;",
+                "events <= (events | {set[9:0], set[10]}) & ~{11{ev_long_frame}};",
+            ),
             ("irq <= |(events & irq_enable);", "irq <= |events;"),
             ("dropped <= dropped + ev_dropped;", "dropped <= dropped + 2 * ev_dropped;"),
             ("columns_out <= columns_out + (out_beat && out_last);", "columns_out <= columns_out + out_beat;"),
@@ -178,7 +180,7 @@ MUTANTS = [
     ),
     (
         "registers",
-        8,
+        7,
         [
             (
                 "else if (!reset_count[RESET_BITS]) reset_count <= reset_count + 1'b1;",
@@ -192,21 +194,21 @@ MUTANTS = [
     ),
     (
         "registers",
-        9,
+        5,
         [
-            ("if (ev_swapped) begin", "bank <= swap;\n                if (ev_swapped || load) begin"),
-            ("bank <= !bank;", ""),
-            ("wire may_load = WRITABLE != 0 && !swap;", "wire may_load = 1'b1;"),
-            ("if (asked && sound) swap", "if (asked) swap"),
+            ("if (ev_swapped) begin", "if (ev_swapped || ev_frame) begin"),
+            ("{second, refused, swap, bank} <= 4'b0000;", "{second, refused, swap, bank} <= 4'b0010;"),
+            ("{count, length_r, expected_r, model_r} <= {4{32'd0}};", "{count, length_r, expected_r} <= {3{32'd1}};"),
+            ("weights <= {load,", "weights <= {load || ev_column,"),
+            ("if (asked && sound) swap", "if (ev_dropped) swap"),
         ],
         "bank_with_swap swap_waits no_write_while_waiting sound_swap",
     ),
     (
         "registers",
-        9,
+        7,
         [
-            ("RESET_BITS = 6", "RESET_BITS = 1"),
-            ("enable <= 1'b0;", "enable <= 1'b1;"),
+            ("running <= enable && reset_count[RESET_BITS];", "running <= 1'b1;"),
             ("deadline <= 32'd0;", "deadline <= 32'd1;"),
             ("in_columns + 16'd1 == columns;\n    wire [2:0]", "in_columns == 16'd0;\n    wire [2:0]"),
             ("assign set[EVENTS_DEADLINE] = miss;", "assign set[EVENTS_DEADLINE] = 1'b0;"),

@@ -1,5 +1,5 @@
-"""The top around the FPGA core: registers over AXI4-Lite, times, deadline and interrupt, errors, weights that are swapped,
-and the C driver that uses them; the destagger ring against the C stream."""
+"""The top around the FPGA core: registers over AXI4-Lite, times, deadline and interrupt, errors, weights that are
+swapped, and the C driver that uses them; the destagger ring against the C stream."""
 
 from __future__ import annotations
 
@@ -293,7 +293,7 @@ def test_a_missed_deadline_interrupts_while_the_sink_is_stuck(rng):
 
 
 def test_a_sink_that_takes_nothing_is_told(rng):
-    """It stops the source before a frame is in: the beat at the output is late, not the frame. Once a wait, not every clock."""
+    """It stops the source before a frame is in: the beat at the output is late, not the frame. Flagged once a wait."""
     image = random_image(rng, shipped().file.rules, TURN)
     with started("serial", DEADLINE=700) as top:
         top.write("IRQ_ENABLE", top.mask("STALLED"))
@@ -612,7 +612,8 @@ def test_the_driver_refuses_what_does_not_fit(driver_library, rng):
     shifted = replace(shifted, distance=replace(shifted.distance, t=shifted.distance.t + 1))
     shifted = Source.of(replace(new.file, signature=b"", int8=shifted).to_bytes(), "shifted")
     cases = [
-        (b"", "IMAGE"), (good[: at - 1], "IMAGE"), (b"UPBX" + good[4:], "IMAGE"), (good[:-8], "IMAGE"), (good[:-1], "IMAGE"),
+        (b"", "IMAGE"), (good[: at - 1], "IMAGE"), (b"UPBX" + good[4:], "IMAGE"),
+        (good[:-8], "IMAGE"), (good[:-1], "IMAGE"),
         (good + bytes(8), "IMAGE"), (good[:4] + b"\2" + good[5:], "IMAGE"), (other_fold, "SHAPE"),
         (weights_image(shipped(), "int16", fold=24).data(), "SHAPE"), (image_of("serial", shifted).data(), "SHAPE"),
         *((good[:n] + bytes([good[n] ^ 1 << int(rng.integers(8))]) + good[n + 1 :], None)
