@@ -45,5 +45,5 @@ def plot_fpga_sweep(found: Sweep) -> Figure:
     axes.set_xlabel("LUTs (logic cells)")
     axes.set_ylabel(f"frames of {found.columns} columns a second")
     axes.set_title("FPGA cores, both networks")
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    axes.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
     return figure

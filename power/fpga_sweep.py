@@ -21,7 +21,7 @@ from upbeam.quant.integer import Precision
 from .catalogue import device
 from .cycles.fpga_core import CoreCycles
 
-__all__ = ["PARTS", "Point", "Sweep", "sweep"]
+__all__ = ["PARTS", "ROUTED", "Point", "Sweep", "sweep"]
 
 PARTS = ("ice40up5k", "ecp5-12", "ecp5-25", "ecp5-85")
 """With an open place and route, the smallest first."""
@@ -156,10 +156,13 @@ def _routed(report: Mapping[str, Any]) -> tuple[int, Clock, str]:
 def _fitted(
     part: str, c: Configuration, fit: Sequence[float], ours: Sequence[Mapping[str, Any]]
 ) -> tuple[int, Clock | None, str]:
-    """ECP5 with multipliers only, and lanes of whole hidden units: what shares multipliers within several lanes, shifts
-    and adds, and other families, are known as routed or not at all."""
-    alike = [r["clock_mhz"] for r in ours if r["part"].startswith("ecp5") and r["fold"] > 1]
-    unlike = c.fold == 1 or (c.phases > 1 and c.lanes > 1)
+    """ECP5 with multipliers only, no more of them than a routed core has, and lanes of whole hidden units: what shares
+    multipliers within several lanes, shifts and adds, and other families, are known as routed or not at all."""
+    routed = [r for r in ours if r["part"].startswith("ecp5") and r["fold"] > 1]
+    alike = [r["clock_mhz"] for r in routed]
+    # No extrapolation: not beyond the multipliers of what was routed.
+    most_multipliers = max((r["resources"]["multipliers"] for r in routed), default=0)
+    unlike = c.fold == 1 or (c.phases > 1 and c.lanes > 1) or _multipliers(c) > most_multipliers
     if not part.startswith("ecp5") or unlike or not alike:
         return 0, None, FITTED
     luts = float(np.dot(fit, _terms(c)))

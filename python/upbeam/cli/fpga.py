@@ -8,7 +8,7 @@ from typing import Any
 from upbeam.hw_sim.fpga.baselines import baselines
 from upbeam.hw_sim.fpga.flow import PARTS, run_flow
 from upbeam.hw_sim.fpga.simulators import cache_folder
-from upbeam.power.fpga_sweep import Point, Sweep, sweep
+from upbeam.power.fpga_sweep import ROUTED, Point, Sweep, sweep
 from upbeam.power.ops import count_model
 from upbeam.quant.export.source import Source
 from upbeam.quant.integer import CONTRACTS, Precision
@@ -73,7 +73,7 @@ def show_sweep(model: Model, precision: str, rate_hz: float, report: Path | None
         emit_json(_as_dict(found))
         return
     rows = [_row(p) for p in found.front]
-    head = ["part", "FOLD", "LANES", "mult.", "clocks", "LUTs", "MHz", "frames/s", "margin", "column us", "mJ a turn"]
+    head = ["part", "FOLD", "LANES", "mult.", "LUTs", "", "MHz", "frames/s", "margin", "mJ a turn", "range"]
     show(table("Cores that no other of their part beats in LUTs and frames", head, rows))
     message(
         f"Clocks: simulated. LUTs and clock: routed, or fitted to routed cores (largest error of a core left out: "
@@ -84,19 +84,19 @@ def show_sweep(model: Model, precision: str, rate_hz: float, report: Path | None
 
 def _row(p: Point) -> list[str]:
     central, low, high = p.energy_mj
-    middle, least, most = p.clock_mhz
+    middle = p.clock_mhz[0]
     return [
         p.part,
         str(p.fold),
         str(p.lanes),
         str(p.multipliers),
-        str(p.clocks),
-        f"{p.luts} {p.luts_label}",
-        f"{middle:.0f} ({least:.0f} to {most:.0f})",
+        str(p.luts),
+        "routed" if p.luts_label == ROUTED else "fitted",
+        f"{middle:.0f}",
         f"{p.frames_per_second:.0f}",
         f"{p.margin:.1f}",
-        f"{p.column_latency_us:.2f}",
-        f"{central:.1f} ({low:.1f} to {high:.1f})",
+        f"{central:.1f}",
+        f"{low:.1f}-{high:.1f}",
     ]
 
 
