@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from upbeam.hw_sim.fpga import ToolError
+from upbeam.hw_sim.fpga import ToolError, bitstream
 from upbeam.hw_sim.fpga.beats import image_beats, output_columns
 from upbeam.hw_sim.fpga.bitstream import board_sources, build_bitstream
 from upbeam.hw_sim.fpga.flow import FlowError
-from upbeam.hw_sim.fpga.simulators import build_top
+from upbeam.hw_sim.fpga.simulators import build_top, sources
 from upbeam.kernels.registers import read_map
 from upbeam.quant.export.rtl import core_headers
 from upbeam.quant.integer import upsample_integer
@@ -162,6 +162,59 @@ def test_the_pin_file_names_every_pin_once():
     assert {name for name, _ in located} == ports
     assert len({site for _, site in located}) == len(located) == len(ports)
     assert set(re.findall(r'^IOBUF PORT "([^"]+)" IO_TYPE=LVCMOS33 ', files["upb_ulx3s.lpf"], re.M)) == ports
+
+
+STUB = """
+// Ports of upb_top and next to nothing behind them: what is tested is the way to a bitstream, and the pins.
+module upb_top #(parameter WRITABLE = 0, parameter DESTAGGER = 0, parameter CLOCK_HZ = 0) (
+    input wire aclk, aresetn,
+    input wire [23:0] s_axis_tdata, input wire s_axis_tvalid, output wire s_axis_tready, input wire s_axis_tlast,
+    input wire [1:0] s_axis_tuser,
+    output wire [47:0] m_axis_tdata, output wire m_axis_tvalid, input wire m_axis_tready, output wire m_axis_tlast,
+    output wire [1:0] m_axis_tuser,
+    input wire [14:0] s_axil_awaddr, input wire [2:0] s_axil_awprot, input wire s_axil_awvalid,
+    output wire s_axil_awready, input wire [31:0] s_axil_wdata, input wire [3:0] s_axil_wstrb, input wire s_axil_wvalid,
+    output wire s_axil_wready, output wire [1:0] s_axil_bresp, output wire s_axil_bvalid, input wire s_axil_bready,
+    input wire [14:0] s_axil_araddr, input wire [2:0] s_axil_arprot, input wire s_axil_arvalid,
+    output wire s_axil_arready, output wire [31:0] s_axil_rdata, output wire [1:0] s_axil_rresp,
+    output wire s_axil_rvalid, input wire s_axil_rready, output wire irq
+);
+    assign {s_axis_tready, m_axis_tdata, m_axis_tvalid} = {m_axis_tready, {2{s_axis_tdata}}, s_axis_tvalid};
+    assign {m_axis_tlast, m_axis_tuser, irq} = {s_axis_tlast, s_axis_tuser, s_axil_wdata[0]};
+    assign {s_axil_awready, s_axil_wready, s_axil_arready, s_axil_bresp, s_axil_rresp} = {3'b111, 4'b0000};
+    assign {s_axil_bvalid, s_axil_rvalid, s_axil_rdata} = {s_axil_wvalid, s_axil_arvalid, 17'd0, s_axil_araddr};
+endmodule
+"""
+
+
+@pytest.fixture
+def stub(monkeypatch):
+    small = {name: text for name, text in sources().items() if name.startswith(("upb_bytes_", "upb_check"))}
+    monkeypatch.setattr(bitstream, "sources", lambda: {**small, "upb_top.sv": STUB})
+
+
+def test_a_bitstream_by_steps(stub, tmp_path):
+    """Its pins are pins of the package; each step leaves its file, and is not done again."""
+    steps = []
+    for _ in range(2):
+        made = build_bitstream(shipped(), "int8", "ulx3s-25", tmp_path, on_step=lambda *step: steps.append(step))
+    names = ("synthesise", "route", "bitstream")
+    assert steps == [*((name, False) for name in names), *((name, True) for name in names)]
+    data = (tmp_path / made["file"]).read_bytes()
+    assert len(data) == made["bytes"] > 1000
+    assert b"LFE5U-25F" in data[:200]
+    assert made["label"] == "built, not run on a board"
+    assert made["used"]["TRELLIS_IO"] == 36
+    assert made["clock_mhz"] >= made["board_clock_mhz"] == 25
+
+
+def test_a_pin_that_the_package_lacks_is_refused(stub, monkeypatch, tmp_path):
+    files = board_sources()
+    monkeypatch.setattr(
+        bitstream, "board_sources", lambda: {n: t.replace('SITE "G2"', 'SITE "AZ99"') for n, t in files.items()}
+    )
+    with pytest.raises(ToolError, match="AZ99"):
+        build_bitstream(shipped(), "int8", "ulx3s-12", tmp_path)
 
 
 def test_an_unknown_board_is_named(tmp_path):

