@@ -43,6 +43,9 @@ module upb_receiver #(
     reg         resync;     // after the edge: wait for a new frame
     reg  [ 4:0] next_beam;
     reg  [15:0] done;       // columns of this frame
+    reg         some;       // there is one
+    reg         nearly;     // the next one is the last: known long before its beam 31
+    reg         whole;      // all are there
     reg         marked;     // the column at hand is marked incomplete
 
     wire        last = in_data[24];
@@ -50,13 +53,12 @@ module upb_receiver #(
     wire        ends = in_data[26];
     wire        top = next_beam == 5'd0;
     wire        bottom = next_beam == 5'd31;
-    wire        whole = done == columns;
     wire        go = slot && room;
     wire        head = go && in_valid;
 
     // The beat at hand begins a frame in the middle of a column or of a frame, or is one column too many: it waits.
     wire        cut_column = starts && !top;
-    wire        cut_frame = starts && top && !whole && done != 16'd0;
+    wire        cut_frame = starts && top && !whole && some;
     wire        beyond = !starts && top && whole;
     wire        waits = cut_column || cut_frame || beyond;
     wire        drop = state == SYNC && head && !starts;
@@ -64,10 +66,10 @@ module upb_receiver #(
     assign in_ready = take || drop;
 
     wire closes = take && bottom;
-    wire [15:0] done_now = done + 16'd1;
-    wire edge_after = ends || (EDGE_SEAM == 0 && done_now == columns);
+    wire edge_after = ends || (EDGE_SEAM == 0 && nearly);
 
     always @(posedge clk) begin
+        nearly <= done + 16'd1 == columns;
         ev_column <= closes;
         ev_frame <= take && starts;
         ev_short_column <= (state == RUN && head && cut_column) || (take && last && !bottom);
@@ -93,12 +95,20 @@ module upb_receiver #(
                     state <= RUN;
                     next_beam <= 5'd0;
                     done <= 16'd0;
+                    {some, whole} <= 2'b00;
                 end
             RUN:
                 if (take) begin
                     next_beam <= next_beam + 5'd1;
-                    if (top && starts) done <= 16'd0;
-                    if (bottom) done <= done_now;
+                    if (top && starts) begin
+                        done <= 16'd0;
+                        {some, whole} <= 2'b00;
+                    end
+                    if (bottom) begin
+                        done <= done + 16'd1;
+                        some <= 1'b1;
+                        whole <= nearly;
+                    end
                     if (last && !bottom) begin
                         state <= PAD;
                         resync <= 1'b1;
@@ -130,6 +140,7 @@ module upb_receiver #(
             resync <= 1'b0;
             next_beam <= 5'd0;
             done <= 16'd0;
+            {some, whole} <= 2'b00;
             beat <= 1'b0;
         end
     end

@@ -30,7 +30,8 @@ from upbeam.quant.integer import (
 from upbeam.quant.sizes import weight_bytes
 
 from .rtl_beams import BEAMS, beams_header
-from .rtl_schedule import Configuration, Words, words
+from .rtl_schedule import Configuration, Words, configuration, weight_bits, words
+from .rtl_weights import WEIGHTS, weights_image
 from .source import NETWORKS, ExportError, NetworkName, Source, new_folder
 
 __all__ = [
@@ -88,21 +89,25 @@ def write_rtl(
     wanted = list(source.precisions if precisions is None else precisions)
     if not wanted:
         raise ExportError(f"{source.name}: no integer networks in this model; upbeam quantize adds them")
-    texts = {precision: _texts(source, source.integer(precision), fold, lanes) for precision in wanted}
+    made = {precision: _files(source, source.integer(precision), fold, lanes) for precision in wanted}
     new_folder(folder)
-    for precision, files in texts.items():
+    for precision, files in made.items():
         (folder / precision).mkdir()
-        for name, text in files.items():
-            (folder / precision / name).write_text(text, encoding="ascii")
-    manifest = _manifest(source, texts)
+        for name, data in files.items():
+            (folder / precision / name).write_bytes(data)
+    manifest = _manifest(source, made)
     (folder / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
     return manifest
 
 
-def _texts(source: Source, model: IntegerModel, fold: int | None, lanes: int) -> dict[str, str]:
+def _files(source: Source, model: IntegerModel, fold: int | None, lanes: int) -> dict[str, bytes]:
     head = f"{source.name} {source.crc32:08x}, {model.contract}"
-    files = core_headers(source, model.precision, fold=fold, lanes=lanes)
-    return files | {memory.file: memory.text(head) for memory in memories(model)}
+    texts = core_headers(source, model.precision, fold=fold, lanes=lanes)
+    texts |= {memory.file: memory.text(head) for memory in memories(model)}
+    files = {name: text.encode("ascii") for name, text in texts.items()}
+    if configuration(model, fold=fold, lanes=lanes).fold > 1:  # else weights are constants
+        files[WEIGHTS] = weights_image(source, model.precision, fold=fold, lanes=lanes).data()
+    return files
 
 
 def core_headers(source: Source, precision: Precision, *, fold: int | None = None, lanes: int = 1) -> dict[str, str]:
@@ -115,7 +120,7 @@ def core_headers(source: Source, precision: Precision, *, fold: int | None = Non
     }
 
 
-def _manifest(source: Source, texts: dict[Precision, dict[str, str]]) -> dict[str, Any]:
+def _manifest(source: Source, made: dict[Precision, dict[str, bytes]]) -> dict[str, Any]:
     sizes = weight_bytes(source.data)
     return {
         "format": FORMAT,
@@ -127,9 +132,9 @@ def _manifest(source: Source, texts: dict[Precision, dict[str, str]]) -> dict[st
             precision: {
                 "contract": CONTRACTS[precision],
                 "weight_bytes": sizes[precision],
-                "files": {f"{precision}/{name}": len(text) for name, text in files.items()},
+                "files": {f"{precision}/{name}": len(data) for name, data in files.items()},
             }
-            for precision, files in texts.items()
+            for precision, files in made.items()
         },
     }
 
@@ -150,10 +155,6 @@ def memories(model: IntegerModel) -> list[Memory]:
             ("V", "output weights, address h", narrow, n.output),
         )
     ]
-
-
-def weight_bits(precision: Precision) -> int:
-    return 8 if precision == "int8" else 16
 
 
 # --------------------------------------------------------------------------------------------------- parameters
@@ -228,13 +229,6 @@ def _packed(name: str, values: I64) -> str:
 
 
 # ------------------------------------------------------------------------------------------------ configuration
-
-
-def configuration(model: IntegerModel, *, fold: int | None = None, lanes: int = 1) -> Configuration:
-    """``fold`` omitted: one hidden unit a clock. Raises ConfigurationError."""
-    hidden = max(n.hidden for n in model)
-    leaky = any(n.slope > 0 for n in model)
-    return Configuration(hidden, hidden if fold is None else fold, lanes, leaky)
 
 
 def configuration_header(source: Source, precision: Precision, c: Configuration) -> str:

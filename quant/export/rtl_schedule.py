@@ -14,9 +14,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from upbeam.quant.integer import HIDDEN_SHIFT, IntegerNetwork, Precision
+from upbeam.quant.integer import HIDDEN_SHIFT, IntegerModel, IntegerNetwork, Precision
 
-__all__ = ["PRODUCTS", "Configuration", "ConfigurationError", "Placed", "Words", "check", "folds", "schedule", "words"]
+__all__ = [
+    "PRODUCTS",
+    "Configuration",
+    "ConfigurationError",
+    "Placed",
+    "Words",
+    "check",
+    "configuration",
+    "folds",
+    "schedule",
+    "weight_bits",
+    "words",
+]
 
 I64 = NDArray[np.int64]
 
@@ -96,6 +108,17 @@ class Configuration:
 def folds(hidden: int) -> list[int]:
     """Every FOLD there is for so many hidden units."""
     return [*range(1, hidden + 1), *(p * hidden for p in PHASES)]
+
+
+def configuration(model: IntegerModel, *, fold: int | None = None, lanes: int = 1) -> Configuration:
+    """``fold`` omitted: one hidden unit a clock. Raises ConfigurationError."""
+    hidden = max(n.hidden for n in model)
+    leaky = any(n.slope > 0 for n in model)
+    return Configuration(hidden, hidden if fold is None else fold, lanes, leaky)
+
+
+def weight_bits(precision: Precision) -> int:
+    return 8 if precision == "int8" else 16
 
 
 # -------------------------------------------------------------------------------------------------- schedule

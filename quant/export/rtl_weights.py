@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from upbeam.quant.integer import IntegerNetwork, Precision
 
-from .rtl import configuration, weight_bits
-from .rtl_schedule import Configuration, ConfigurationError, words
+from .rtl_schedule import Configuration, ConfigurationError, configuration, weight_bits, words
 from .source import Source
 
 __all__ = ["MAGIC", "WEIGHTS", "WeightsImage", "weights_image"]

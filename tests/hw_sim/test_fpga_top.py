@@ -18,7 +18,7 @@ from upbeam.hw_sim.fpga import RtlCore, ToolError
 from upbeam.hw_sim.fpga.beats import ENDS, LAST, STARTS, column_beats, image_beats
 from upbeam.hw_sim.fpga.top import RegisterError, Top, library
 from upbeam.kernels import registers
-from upbeam.quant.export.rtl import core_headers
+from upbeam.quant.export.rtl import core_headers, write_rtl
 from upbeam.quant.export.rtl_schedule import ConfigurationError
 from upbeam.quant.export.rtl_weights import HEAD, weights_image
 from upbeam.quant.export.source import Source
@@ -549,6 +549,13 @@ def test_a_damaged_image_is_never_used(rng):
             top.drain()
             assert equal(top.columns(), expected("serial", pixels))
         assert top.read("MODEL_CRC") == shipped().crc32
+
+
+def test_the_exported_image(tmp_path):
+    write_rtl(shipped(), tmp_path / "folded", ["int8"], fold=24)
+    assert (tmp_path / "folded" / "int8" / "upb_weights.bin").read_bytes() == image_of("serial", shipped()).data()
+    write_rtl(shipped(), tmp_path / "constant", ["int8"], fold=1)
+    assert not (tmp_path / "constant" / "int8" / "upb_weights.bin").exists()
 
 
 def test_constants_have_no_image():
