@@ -164,7 +164,7 @@ def test_goals_are_met_as_routed():
     assert large["margin"] >= 5
     assert large["utilisation"]["luts"]["used"] <= 0.25 * large["utilisation"]["luts"]["available"]
     small = found[Build("hdl-64e", "int8", "ice40up5k", 24).name]
-    assert small["clock_mhz"]["seeds"] >= 2
+    assert small["clock_mhz"]["seeds"] >= 5
     assert small["utilisation"]["multipliers"] == {"used": 8, "available": 8}
     assert small["margin"] >= 1
 
