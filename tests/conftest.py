@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -67,3 +69,10 @@ def data_dir() -> Path:
     if not data.is_dir():
         pytest.skip(f"no real LiDAR data: {data} is not a folder (set UPBEAM_DATA)")
     return data
+
+
+@pytest.fixture(autouse=True)
+def _subnormals_kept() -> Iterator[None]:
+    """A library that flushes subnormals in this thread breaks later tests far from the cause: it fails here."""
+    yield
+    assert sys.float_info.min / 2 > 0.0, "this test, or one of its fixtures, made subnormal numbers count as zero"

@@ -6,6 +6,7 @@ import ctypes
 import platform
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -82,15 +83,33 @@ def _settings(quick: bool) -> Iterator[tuple[tuple[str, ...], int]]:
 
 def _build(compiler: str, path: str, flags: tuple[str, ...], shape: int, hidden: int, folder: Path) -> Built:
     library = folder / f"plain_{compiler}_{FLAGS.index(flags)}_{shape}.so"
-    fixed = [f"-DHIDDEN={hidden}", f"-DSHAPE={shape}", "-shared", "-fPIC", "-o", str(library)]
-    done = subprocess.run(
-        [path, *flags, *fixed, str(_FOLDER / "plain_windows.c"), "-lm"],
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    unit = library.with_suffix(".o")
+    defines = (f"-DHIDDEN={hidden}", f"-DSHAPE={shape}")
+    _compile(path, *flags, *defines, "-fPIC", "-c", "-o", str(unit), str(_FOLDER / "plain_windows.c"))
+    # Linked without the flags: given -ffast-math, gcc and clang link crtfastmath.o, a constructor that makes the thread
+    # that loads the library treat subnormal numbers as zero, in all its code and for good.
+    _compile(path, "-shared", "-o", str(library), str(unit), "-lm")
+    version = subprocess.run([path, "-dumpfullversion", "-dumpversion"], capture_output=True, text=True, check=False)
+    return Built(compiler, version.stdout.strip(), flags, shape, _load(library))
+
+
+def _compile(*command: str) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     if done.returncode:
         raise CompileError(" ".join(done.stderr.split())[:300] or f"status {done.returncode}")
-    version = subprocess.run([path, "-dumpfullversion", "-dumpversion"], capture_output=True, text=True, check=False)
-    return Built(compiler, version.stdout.strip(), flags, shape, ctypes.CDLL(str(library)))
+
+
+def _load(library: Path) -> ctypes.CDLL:
+    """Raises RuntimeError where loading it makes this thread treat subnormal numbers as zero."""
+    kept = _keeps_subnormals()
+    loaded = ctypes.CDLL(str(library))
+    if kept and not _keeps_subnormals():
+        raise RuntimeError(f"{library.name}: loading it made this process treat subnormal numbers as zero")
+    return loaded
+
+
+def _keeps_subnormals() -> bool:
+    return sys.float_info.min / 2 > 0.0
 
 
 def plain_candidate(built: Built, work: Work, precision: str) -> Candidate:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,14 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from upbeam.power.bench import _native
+from upbeam.power.bench import _native, plain
 from upbeam.power.bench.bench import Benchmark, Settings, benchmark, make_work, ratios
 from upbeam.power.bench.contest import Candidate, Entry, alternate
 from upbeam.power.bench.machine import Bound, Peak, Peaks, measure_peaks
 from upbeam.power.bench.ours import kernel_candidates, make_job, usable_cpus
 from upbeam.power.bench.peers import PEERS, PeerPool, missing_peers, pool
 from upbeam.power.bench.peers.formulation import Formulation
-from upbeam.power.bench.plain import Built, build_all, plain_candidate
+from upbeam.power.bench.plain import COMPILERS, FLAGS, Built, CompileError, build_all, plain_candidate
 from upbeam.power.bench.plot import plot_times
 from upbeam.power.bench.tables import tables
 from upbeam.power.bench.work import DifferenceError, Work, check_image, check_windows, synthetic_frame
@@ -205,6 +207,58 @@ def test_plain_c_that_computes_something_else_is_refused(built: list[Built], wor
         entries, refused = alternate([swapped], 1)
         assert not entries
         assert "refused, not timed" in refused[0]
+
+
+FLUSHING = """
+__attribute__((constructor)) static void flush_subnormals(void) {
+#if defined(__x86_64__)
+    __builtin_ia32_ldmxcsr(__builtin_ia32_stmxcsr() | 0x8040);
+#elif defined(__aarch64__)
+    unsigned long fpcr;
+    __asm__ volatile("mrs %0, fpcr" : "=r"(fpcr));
+    __asm__ volatile("msr fpcr, %0" : : "r"(fpcr | 1ul << 24));
+#else
+#error "no mode that flushes subnormals is known here"
+#endif
+}
+"""
+
+
+def _available_compilers() -> list[tuple[str, str]]:
+    found = [(name, path) for name in COMPILERS if (path := shutil.which(name)) is not None]
+    return found or pytest.skip(f"none of {', '.join(COMPILERS)} on this machine")
+
+
+def _in_a_thread(function: Callable[..., Any], *arguments: Any) -> Any:
+    """The floating-point mode belongs to the thread: what a library does to it ends with this one."""
+    with ThreadPoolExecutor(1) as threads:
+        return threads.submit(function, *arguments).result()
+
+
+def test_plain_c_leaves_the_floating_point_mode_alone(tmp_path: Path) -> None:
+    """Loaded libraries must not flush subnormals: SciPy's k-d tree then recurses until the stack is used up."""
+    tried = 0
+
+    def keeps(*arguments: Any) -> bool:
+        plain._build(*arguments)
+        return float(np.finfo(float).tiny) / 2 > 0
+
+    for name, path in _available_compilers():
+        for flags in FLAGS:
+            try:
+                assert _in_a_thread(keeps, name, path, flags, 0, 1, tmp_path), f"{name} {' '.join(flags)}"
+                tried += 1
+            except CompileError as error:
+                print(f"{name} {' '.join(flags)}: not known ({error})")
+    assert tried
+
+
+def test_a_library_that_flushes_subnormals_is_refused(tmp_path: Path) -> None:
+    library = tmp_path / "flushing.so"
+    command = [_available_compilers()[0][1], "-x", "c", "-", "-shared", "-fPIC", "-o", str(library)]
+    subprocess.run(command, input=FLUSHING, text=True, check=True)
+    with pytest.raises(RuntimeError, match=r"flushing\.so: loading it made .* subnormal numbers as zero"):
+        _in_a_thread(plain._load, library)
 
 
 def _checked_as(_: Candidate, stranger: Candidate, work: Work) -> None:
