@@ -106,7 +106,8 @@ def sweep(
         for r in routed.values()
         if r["model_crc32"] == f"{source.crc32:08x}" and r["precision"] == precision and "clock_mhz" in r
     ]
-    fit, error = _fit([r for r in ours if r["part"].startswith("ecp5") and r["fold"] > 1], source, precision)
+    alike = [r for r in ours if r["part"].startswith("ecp5") and _is_fitted(_configuration(r, source, precision))]
+    fit, error = _fit(alike, source, precision)
     columns = source.file.rules.columns
     points = []
     for part in PARTS:
@@ -141,6 +142,16 @@ def _configurations(source: Source, precision: Precision, multipliers: int) -> I
                 yield c
 
 
+def _configuration(report: Mapping[str, Any], source: Source, precision: Precision) -> Configuration:
+    return configuration(source.integer(precision), fold=report["fold"], lanes=report["lanes"])
+
+
+def _is_fitted(c: Configuration) -> bool:
+    """Multipliers, and lanes of whole hidden units: shifts and adds, and what shares multipliers within several lanes
+    (31 % more LUTs than the fit says, routed once), are known as routed or not at all."""
+    return c.fold > 1 and (c.phases == 1 or c.lanes == 1)
+
+
 def _multipliers(c: Configuration) -> int:
     return 0 if c.fold == 1 else NETWORKS * c.lanes * c.multipliers
 
@@ -156,13 +167,12 @@ def _routed(report: Mapping[str, Any]) -> tuple[int, Clock, str]:
 def _fitted(
     part: str, c: Configuration, fit: Sequence[float], ours: Sequence[Mapping[str, Any]]
 ) -> tuple[int, Clock | None, str]:
-    """ECP5 with multipliers only, no more of them than a routed core has, and lanes of whole hidden units: what shares
-    multipliers within several lanes, shifts and adds, and other families, are known as routed or not at all."""
+    """ECP5 only, and no more multipliers than a routed core has; other families are known as routed or not at all."""
     routed = [r for r in ours if r["part"].startswith("ecp5") and r["fold"] > 1]
     alike = [r["clock_mhz"] for r in routed]
     # No extrapolation: not beyond the multipliers of what was routed.
     most_multipliers = max((r["resources"]["multipliers"] for r in routed), default=0)
-    unlike = c.fold == 1 or (c.phases > 1 and c.lanes > 1) or _multipliers(c) > most_multipliers
+    unlike = not _is_fitted(c) or _multipliers(c) > most_multipliers
     if not part.startswith("ecp5") or unlike or not alike:
         return 0, None, FITTED
     luts = float(np.dot(fit, _terms(c)))
@@ -185,8 +195,7 @@ def _fit(ours: Sequence[Mapping[str, Any]], source: Source, precision: Precision
         raise ValueError(
             f"{len(ours)} routed ECP5 cores of this model in {precision}: expected 4 or more to fit others"
         )
-    model = source.integer(precision)
-    terms = np.array([_terms(configuration(model, fold=r["fold"], lanes=r["lanes"])) for r in ours])
+    terms = np.array([_terms(_configuration(r, source, precision)) for r in ours])
     luts = np.array([float(r["utilisation"]["luts"]["used"]) for r in ours])
     errors = []
     for n in range(len(ours)):
