@@ -46,6 +46,7 @@ _SECTIONS: dict[str, dict[str, str]] = {
         "idle": "power",
         "cpu_active": "power",
         "mac_energy": "energy of work",
+        "core_voltage": "voltage",
         "node": "length",
     },
     "scheduling": {"wakeup": "time"},

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from .catalogue import CatalogueError, Device
-from .cycles.fpga import smallest_core
-from .estimate import Load, cpu_column_time
+from .estimate import Load, core_clock, cpu_column_time, default_core
 from .figures import Figure
+from .fpga_built import BuiltCores
 
 __all__ = ["SERVICES", "Service", "target_service"]
 
@@ -63,16 +63,18 @@ def target_service(
     mode: str | None = None,
     service: str = "central",
     seed: int = 0,
+    built: BuiltCores | None = None,
 ) -> Service:
     """Of a device of the catalogue: a CPU's columns and the wake-up of its thread, drawn log-normally from ``seed``; an
-    FPGA's cycles, which do not vary. The same arguments give the same numbers. Raises CatalogueError."""
+    FPGA's cycles, which do not vary, at the clock that ``built`` knows of its core. The same arguments give the same
+    numbers. Raises CatalogueError."""
     if service not in SERVICES:
         raise CatalogueError(f"service {service!r}, expected one of {', '.join(SERVICES)}")
     if device.family == "host":
         raise CatalogueError("host: --clock real measures this machine; targets are for others")
     chosen = device.mode(mode)
     if device.family == "fpga":
-        column, cores = _fpga_column(device, load), 1
+        column, cores = _fpga_column(device, load, built), 1
         wakeup = Figure.exact(0.0, "us", "modelled", "a core of its own does not wait for a thread")
     else:
         column = cpu_column_time(device, load, chosen).push.to("us")
@@ -83,11 +85,12 @@ def target_service(
     return Service(device, chosen.name if chosen else None, column, wakeup, packets, service, cores, seed)
 
 
-def _fpga_column(device: Device, load: Load) -> Figure:
-    core = smallest_core(int(device.figure("fpga.multipliers").get("1")), load.count.folded_hidden)
-    mhz, slow, fast = device.figure("fpga.clock").span("MHz")
+def _fpga_column(device: Device, load: Load, built: BuiltCores | None) -> Figure:
+    core = default_core(device, load, built)
+    clock = core_clock(device, core, built)
+    mhz, slow, fast = clock.span("MHz")
     cycles = core.column_cycles
-    source = f"{cycles} cycles a column (LANES {core.lanes}, FOLD {core.fold}); clock: assumption"
+    source = f"{cycles} cycles a column (LANES {core.lanes}, FOLD {core.fold}); clock, {clock.kind}: {clock.source}"
     return Figure(cycles / mhz, cycles / fast, cycles / slow, "us", "modelled", source)
 
 

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from upbeam.quant.integer import Precision
+
 from . import energy
 from .catalogue import CatalogueError, Device, Mode, cpu_core
 from .cycles.cpu import CpuCore, CpuTime, cpu_time
@@ -18,9 +20,22 @@ from .cycles.fpga import FpgaCore, smallest_core
 from .cycles.gpu import gpu_latency, window_work
 from .energy import EnergyModel, LeaveOneOut, Row
 from .figures import Figure
+from .fpga_activity import core_volts, dynamic_energy, toggles_of_a_turn
+from .fpga_built import BuiltCores
 from .ops import OperationCount
 
-__all__ = ["IMPLEMENTATIONS", "Bounded", "Errors", "Estimate", "Knowledge", "Load", "estimate_load", "estimate_macs"]
+__all__ = [
+    "IMPLEMENTATIONS",
+    "Bounded",
+    "Errors",
+    "Estimate",
+    "Knowledge",
+    "Load",
+    "core_clock",
+    "default_core",
+    "estimate_load",
+    "estimate_macs",
+]
 
 IMPLEMENTATIONS = {"jetson": ("cpu", "gpu"), "fpga": ("fpga",), "host": ("cpu",)}
 """What each family of devices can run our load on; the first is the default."""
@@ -83,6 +98,11 @@ class Load:
     def macs(self) -> int:
         """Executed for a frame."""
         return 2 * self.count.macs_folded * self.count.windows
+
+    @property
+    def fpga_precision(self) -> Precision:
+        """The core has no float: int8 instead."""
+        return "int16" if self.precision == "int16" else "int8"
 
     @property
     def period_ms(self) -> float:
@@ -289,16 +309,18 @@ def estimate_load(
     implementation: str | None = None,
     mode: str | None = None,
     core: FpgaCore | None = None,
+    built: BuiltCores | None = None,
 ) -> Estimate:
-    """Frames of a window network at a rate. ``implementation``: of ``IMPLEMENTATIONS``. ``core``: the FPGA core, the
-    smallest fold that fits if omitted. Not for the host, which is measured (``power/host.py``). Raises
-    CatalogueError."""
+    """Frames of a window network at a rate. ``implementation``: of ``IMPLEMENTATIONS``. ``core``: the FPGA core,
+    ``default_core`` if omitted; ``built``: what is known of cores of the model. Not for the host, which is measured
+    (``power/host.py``). Raises CatalogueError."""
     runs_on = implementation or IMPLEMENTATIONS[device.family][0]
     if runs_on not in IMPLEMENTATIONS[device.family] or device.family == "host":
         raise CatalogueError(f"{device.name} runs our load on {', '.join(IMPLEMENTATIONS[device.family])}")
     chosen = device.mode(mode)
-    estimate = {"cpu": _on_cpu, "gpu": _on_gpu, "fpga": _on_fpga}[runs_on]
-    return estimate(device, load, known, chosen, core)
+    if runs_on == "fpga":
+        return _on_fpga(device, load, known, core, built or BuiltCores())
+    return (_on_cpu if runs_on == "cpu" else _on_gpu)(device, load, known, chosen)
 
 
 def cpu_column_time(device: Device, load: Load, mode: Mode | None) -> CpuTime:
@@ -319,7 +341,7 @@ def _at_clock(time: Figure, clock: Figure) -> Figure:
     return replace(time, value=value, low=low * central / fast, high=high * central / slow, unit="ns")
 
 
-def _on_cpu(device: Device, load: Load, known: Knowledge, mode: Mode | None, _: FpgaCore | None) -> Estimate:
+def _on_cpu(device: Device, load: Load, known: Knowledge, mode: Mode | None) -> Estimate:
     assert mode is not None
     latency = cpu_column_time(device, load, mode).frame(load.columns)
     fastest = max(m.figures["cpu_clock"].get("MHz") for m in device.modes.values())
@@ -336,7 +358,7 @@ def _on_cpu(device: Device, load: Load, known: Knowledge, mode: Mode | None, _: 
     return _at_rate(device, "cpu", mode, what, load, latency, increment, known, sensors, memory)
 
 
-def _on_gpu(device: Device, load: Load, known: Knowledge, mode: Mode | None, _: FpgaCore | None) -> Estimate:
+def _on_gpu(device: Device, load: Load, known: Knowledge, mode: Mode | None) -> Estimate:
     assert mode is not None
     work = window_work(load.count)
     share = mode.figures["gpu_clock"].get("MHz") / device.figure("gpu.clock").get("MHz")
@@ -365,32 +387,84 @@ def _full_load_increment(device: Device, mode: Mode, known: Knowledge) -> float:
     return max(limit - idle, 0.1 * idle)
 
 
-def _on_fpga(device: Device, load: Load, known: Knowledge, mode: Mode | None, core: FpgaCore | None) -> Estimate:
-    hidden = load.count.folded_hidden
-    core = core or smallest_core(int(device.figure("fpga.multipliers").get("1")), hidden, MULTIPLIER_LIMIT)
-    latency = core.latency(device.figure("fpga.clock"), load.columns)
-    per_second = load.macs * load.rate_hz
-    value, low, high = (x * per_second for x in device.figure("power.mac_energy").span("J/MAC"))
-    increment = Figure(value, low, high, "W", "assumption", device.figure("power.mac_energy").source)
+def default_core(device: Device, load: Load, built: BuiltCores | None = None) -> FpgaCore:
+    """The least fold above 1 that fits a part, of those whose LUTs are known where any are. Raises FpgaCoreError."""
+    hidden, there = load.count.folded_hidden, int(device.figure("fpga.multipliers").get("1"))
+    most = built.most_multipliers(device.name, load.fpga_precision, hidden) if built else None
+    return smallest_core(there, hidden, MULTIPLIER_LIMIT, precision=load.fpga_precision, known=most)
+
+
+def core_clock(device: Device, core: FpgaCore, built: BuiltCores | None) -> Figure:
+    """As routed or fitted, else of the catalogue."""
+    return (built.clock(device.name, core) if built else None) or device.figure("fpga.clock")
+
+
+def _on_fpga(device: Device, load: Load, known: Knowledge, core: FpgaCore | None, built: BuiltCores) -> Estimate:
+    core = core or default_core(device, load, built)
+    clock = core_clock(device, core, built)
+    latency = core.latency(clock, load.columns)
+    increment, notes = _fpga_increment(device, load, core, clock, built)
     sensors = tuple(int(load.period_ms / x) for x in (latency.span("ms")[k] for k in (0, 2, 1)))
     what = (
-        f"both images of a 32 x {load.columns} frame in int8, LANES {core.lanes}, FOLD {core.fold}, {load.rate_hz:g} Hz"
+        f"both images of a 32 x {load.columns} frame in {core.precision}, LANES {core.lanes}, FOLD {core.fold}, "
+        f"{load.rate_hz:g} Hz"
     )
-    return _at_rate(device, "fpga", mode, what, load, latency, increment, known, sensors, _fit(device, core, load))
+    used = _fit(device, core, load, built)
+    found = _at_rate(device, "fpga", None, what, load, latency, increment, known, sensors, used)
+    return replace(found, notes=(*found.notes, *notes))
 
 
-def _fit(device: Device, core: FpgaCore, load: Load) -> dict[str, Any]:
-    """What of the part is used. LUTs are an assumption until a core has been routed."""
+def _fpga_increment(
+    device: Device, load: Load, core: FpgaCore, clock: Figure, built: BuiltCores
+) -> tuple[Figure, tuple[str, ...]]:
+    """Dynamic power, W, and what is to be said of it: of the core's switching activity where it was simulated and the
+    part is of the process that a toggle's energy is stated for, else of multiply-accumulates."""
+    activity, volts = built.activity(core), core_volts(device)
+    if activity is None or volts is None:
+        value, low, high = (x * load.macs * load.rate_hz for x in device.figure("power.mac_energy").span("J/MAC"))
+        return Figure(value, low, high, "W", "assumption", device.figure("power.mac_energy").source), ()
+    turn_s = load.period_ms / 1e3
+    every, working = toggles_of_a_turn(activity, load.columns, clock.get("Hz"), turn_s)
+    energy, least = dynamic_energy(every, volts), dynamic_energy(working, volts)
+    value, low, high = (x / turn_s for x in energy.span("J"))
+    source = (
+        f"switching activity of {activity['frame']} ({activity['tool']}) at {clock.get('MHz'):.1f} MHz, "
+        f"{100 * working / every:.0f} % of it while computing: {energy.source}"
+    )
+    slow_mhz = core.column_cycles * load.columns * load.rate_hz / 1e6
+    central, least_mj, most_mj = least.span("mJ")
+    note = (
+        f"The core's schedule toggles while it waits. With its clock enabled only for frames, or at the {slow_mhz:.3g} "
+        f"MHz that carry this rate, the added energy is {central:.2g} mJ a frame ({least_mj:.2g} to {most_mj:.2g})."
+    )
+    unseen = "Dynamic power is modelled from RTL activity, which misses glitches; the clock tree is not in it."
+    return Figure(value, low, high, "W", "modelled", source), (unseen, note)
+
+
+def _luts(device: Device, core: FpgaCore, built: BuiltCores) -> tuple[Figure, str]:
+    """And how they are known."""
+    found = built.luts(device.name, core)
+    if found is not None:
+        return found, "routed (nextpnr)" if found.kind == "simulated" else "fitted"
     luts, low, high = (x * core.multipliers for x in _LUTS_OF_A_MULTIPLIER.span("1"))
+    return Figure(luts, low, high, "1", "assumption", _LUTS_OF_A_MULTIPLIER.source), "assumption"
+
+
+def _fit(device: Device, core: FpgaCore, load: Load, built: BuiltCores) -> dict[str, Any]:
+    """What of the part is used."""
+    luts, label = _luts(device, core, built)
     there = device.figure("fpga.luts").get("1")
     multipliers = device.figure("fpga.multipliers").get("1")
     # Three prepared columns of four rows, 16 bits; weights of both networks.
-    bits = 3 * 4 * 32 * 16 + 8 * load.count.weight_bytes_folded("int8")
+    bits = 3 * 4 * 32 * 16 + 8 * load.count.weight_bytes_folded(core.precision)
+    _, low, high = luts.span("1")
     fits = "yes" if high <= LUT_LIMIT * there else "no" if low > LUT_LIMIT * there else "not certain"
+    if luts.kind == "simulated":
+        fits = "yes"  # it was placed and routed there
     return {
         "multipliers": core.multipliers,
         "multipliers_of": int(multipliers),
-        "luts": {"value": luts, "low": low, "high": high, "kind": "assumption", "source": _LUTS_OF_A_MULTIPLIER.source},
+        "luts": {**luts.as_dict(), "label": label},
         "luts_of": int(there),
         "ram_bits": bits,
         "ram_bits_of": int(device.figure("fpga.ram").get("B") * 8),
@@ -406,7 +480,9 @@ def _at_rate(
     idle = _idle(device, known)
     value, low, high = (a + b for a, b in zip(idle.span("W"), increment.span("W"), strict=True))
     kind = "assumption" if idle.kind == "assumption" else "modelled"
-    power = Figure(value, low, high, "W", kind, f"at rest: {idle.source}; plus {increment.source}")
+    power = Figure(
+        value, low, high, "W", kind, f"at rest ({idle.kind}): {idle.source}; plus ({increment.kind}) {increment.source}"
+    )
     turn = Figure.exact(load.period_ms, "ms", "given", "the sensor's turn").to("s")
     boundary = _boundary(device, known)
     rest = idle.get("W") / value

@@ -22,6 +22,7 @@ from .estimate_pictures import (
     plot_power,
     plot_roofline,
 )
+from .fpga_activity import GLITCHES, NET_FF, core_volts
 from .ops import PAPER_MEMORY_NOTE
 from .report import Picture, _flat, page_template
 
@@ -91,7 +92,7 @@ def _page(
         "quantised_on": model["quantisation"].get("against_float_on", ""),
         "errors": as_table(known.results),
         "skill": {w: energy.skill(known.results, w) for w in ("power", "latency", "energy")},
-        "assumptions": _figures_of(lambda kind: kind == "assumption"),
+        "assumptions": [*_figures_of(lambda kind: kind == "assumption"), *_of_activity()],
         "measured": _figures_of(lambda kind: kind.startswith("measured")),
         "data_sheets": _data_sheets(),
         "sources": list(dict.fromkeys(row.source for row in known.model.rows)),
@@ -135,8 +136,8 @@ def _memory(memory: Mapping[str, Any]) -> str:
     if "luts_of" in memory:
         luts = memory["luts"]
         return (
-            f"{memory['multipliers']} of {memory['multipliers_of']} multipliers; about {luts['value']:.0f} "
-            f"({luts['low']:.0f} to {luts['high']:.0f}) of {memory['luts_of']} LUTs (assumed); "
+            f"{memory['multipliers']} of {memory['multipliers_of']} multipliers; {luts['value']:.0f} "
+            f"({luts['low']:.0f} to {luts['high']:.0f}) of {memory['luts_of']} LUTs ({luts['label']}); "
             f"{memory['ram_bits'] / 8:.0f} B of RAM. Fits: {memory['fits']}"
         )
     if "bytes" in memory:
@@ -193,6 +194,18 @@ def _figures_of(wanted: Any) -> list[tuple[str, str, str, str]]:
                 text = f"{figure.value:g}{interval} {figure.unit}"
                 found.setdefault((key, text, figure.source + by), []).append(name)
     return [(", ".join(names), key, value, source) for (key, value, source), names in found.items()]
+
+
+def _of_activity() -> list[tuple[str, str, str, str]]:
+    """What turns toggles of the FPGA core into energy, as ``_figures_of``."""
+    names = ", ".join(name for name in device_names() if core_volts(device(name)) is not None)
+    return [
+        (names, key, f"{value:g} ({low:g} to {high:g}) {unit}", why)
+        for key, (value, low, high), unit, why in (
+            ("capacitance of a net", NET_FF, "fF", "with its routing, 40 nm"),
+            ("glitches", GLITCHES, "toggles for each of RTL", "RTL activity misses them"),
+        )
+    ]
 
 
 def _data_sheets() -> list[tuple[str, str]]:

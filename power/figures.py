@@ -39,6 +39,7 @@ UNITS: dict[str, tuple[str, float]] = {
     "GMAC/s": ("throughput", 1e9),
     "pJ/MAC": ("energy of work", 1e-12),
     "J/MAC": ("energy of work", 1.0),
+    "V": ("voltage", 1.0),
     "bit": ("width", 1.0),
     "nm": ("length", 1e-9),
 }

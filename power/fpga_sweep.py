@@ -6,20 +6,20 @@ Routed cores are handed in (``hw_sim.fpga.baselines``): this package does not kn
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from statistics import median
 from typing import Any
-
-import numpy as np
 
 from upbeam.quant.export.rtl import configuration
 from upbeam.quant.export.rtl_schedule import Configuration, folds
 from upbeam.quant.export.source import Source
 from upbeam.quant.integer import Precision
 
-from .catalogue import device
+from .catalogue import Device, device
+from .cycles.fpga import FpgaCore
 from .cycles.fpga_core import CoreCycles
+from .fpga_activity import core_volts, dynamic_energy, toggles_of_a_turn
+from .fpga_built import BuiltCores, Clock, LutFit, multipliers_of
 
 __all__ = ["PARTS", "ROUTED", "Point", "Sweep", "sweep"]
 
@@ -28,7 +28,6 @@ PARTS = ("ice40up5k", "ecp5-12", "ecp5-25", "ecp5-85")
 ROUTED, FITTED = "routed", "fitted to routed"
 LUT_LIMIT = 0.9
 """Of a part, for a core that was not routed: a fuller part may not route."""
-NETWORKS = 2
 
 
 @dataclass(frozen=True)
@@ -97,38 +96,59 @@ def _beats(q: Point, p: Point) -> bool:
 
 
 def sweep(
-    source: Source, precision: Precision, routed: Mapping[str, Mapping[str, Any]], macs: int, rate_hz: float = 20.0
+    source: Source,
+    precision: Precision,
+    routed: Mapping[str, Mapping[str, Any]],
+    macs: int,
+    rate_hz: float = 20.0,
+    activities: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Sweep:
-    """``routed``: reports of the flow by name, of any model; those of this model and precision count. ``macs`` of a
-    frame. Raises ValueError where too few are routed to fit others."""
+    """``routed``: reports of the flow by name, of any model; those of this model and precision count, and so with
+    ``activities``; where there is none, energy is that of ``macs`` of a frame. Raises ValueError where too few are
+    routed to fit others."""
     ours = [
         r
         for r in routed.values()
         if r["model_crc32"] == f"{source.crc32:08x}" and r["precision"] == precision and "clock_mhz" in r
     ]
-    alike = [r for r in ours if r["part"].startswith("ecp5") and _is_fitted(_configuration(r, source, precision))]
-    fit, error = _fit(alike, source, precision)
+    try:
+        fit = LutFit.of(ours, max(n.hidden for n in source.integer(precision)))
+    except ValueError as error:
+        raise ValueError(f"this model in {precision}: {error}") from None
     columns = source.file.rules.columns
+    built = BuiltCores.of(source.crc32, {}, activities or {})
     points = []
     for part in PARTS:
         there = device(part)
         for c in _configurations(source, precision, int(there.figure("fpga.multipliers").get("1"))):
             found = [r for r in ours if (r["part"], r["fold"], r["lanes"]) == (part, c.fold, c.lanes)]
-            luts, clock, label = _routed(found[0]) if found else _fitted(part, c, fit, ours)
+            luts, clock, label = _routed(found[0]) if found else _fitted(part, c, fit)
             if clock is None or (luts > LUT_LIMIT * there.figure("fpga.luts").get("1") and not found):
                 continue
             cycles = CoreCycles.of(c, precision, source.file.rules)
-            mac = there.figure("power.mac_energy").span("J/MAC")
+            core = FpgaCore(c.lanes, c.fold, c.hidden, precision)
+            added = _added_joules(there, built.activity(core), macs, columns, clock[0] * 1e6, 1 / rate_hz)
             idle = there.figure("power.idle").span("W")
             fps = cycles.frames_per_second(clock[0] * 1e6, columns)
-            energy = tuple(1e3 * (m * macs + w / rate_hz) for m, w in zip(mac, idle, strict=True))
+            energy = tuple(1e3 * (j + w / rate_hz) for j, w in zip(added, idle, strict=True))
             points.append(
                 Point(
-                    part, c.fold, c.lanes, _multipliers(c), cycles.frame(columns), luts, label, clock, label, fps,
+                    part, c.fold, c.lanes, multipliers_of(c), cycles.frame(columns), luts, label, clock, label, fps,
                     fps / rate_hz, cycles.column_latency / clock[0], (energy[0], energy[1], energy[2]),
                 )
             )  # fmt: skip
-    return Sweep(tuple(points), error, rate_hz, columns)
+    return Sweep(tuple(points), fit.error, rate_hz, columns)
+
+
+def _added_joules(
+    part: Device, activity: Mapping[str, Any] | None, macs: int, columns: int, clock_hz: float, turn_s: float
+) -> tuple[float, float, float]:
+    """Of a turn: of the core's switching activity, else of multiply-accumulates."""
+    volts = core_volts(part)
+    if activity is not None and volts is not None:
+        return dynamic_energy(toggles_of_a_turn(activity, columns, clock_hz, turn_s)[0], volts).span("J")
+    value, low, high = (x * macs for x in part.figure("power.mac_energy").span("J/MAC"))
+    return value, low, high
 
 
 def _configurations(source: Source, precision: Precision, multipliers: int) -> Iterator[Configuration]:
@@ -138,25 +158,8 @@ def _configurations(source: Source, precision: Precision, multipliers: int) -> I
     for fold in folds(hidden):
         for lanes in (n for n in range(1, fold + 1) if fold % n == 0):
             c = configuration(model, fold=fold, lanes=lanes)
-            if _multipliers(c) <= multipliers:
+            if multipliers_of(c) <= multipliers:
                 yield c
-
-
-def _configuration(report: Mapping[str, Any], source: Source, precision: Precision) -> Configuration:
-    return configuration(source.integer(precision), fold=report["fold"], lanes=report["lanes"])
-
-
-def _is_fitted(c: Configuration) -> bool:
-    """Multipliers, and lanes of whole hidden units: shifts and adds, and what shares multipliers within several lanes
-    (31 % more LUTs than the fit says, routed once), are known as routed or not at all."""
-    return c.fold > 1 and (c.phases == 1 or c.lanes == 1)
-
-
-def _multipliers(c: Configuration) -> int:
-    return 0 if c.fold == 1 else NETWORKS * c.lanes * c.multipliers
-
-
-Clock = tuple[float, float, float]
 
 
 def _routed(report: Mapping[str, Any]) -> tuple[int, Clock, str]:
@@ -164,42 +167,5 @@ def _routed(report: Mapping[str, Any]) -> tuple[int, Clock, str]:
     return report["utilisation"]["luts"]["used"], (clock["median"], clock["least"], clock["most"]), ROUTED
 
 
-def _fitted(
-    part: str, c: Configuration, fit: Sequence[float], ours: Sequence[Mapping[str, Any]]
-) -> tuple[int, Clock | None, str]:
-    """ECP5 only, and no more multipliers than a routed core has; other families are known as routed or not at all."""
-    routed = [r for r in ours if r["part"].startswith("ecp5") and r["fold"] > 1]
-    alike = [r["clock_mhz"] for r in routed]
-    # No extrapolation: not beyond the multipliers of what was routed.
-    most_multipliers = max((r["resources"]["multipliers"] for r in routed), default=0)
-    unlike = not _is_fitted(c) or _multipliers(c) > most_multipliers
-    if not part.startswith("ecp5") or unlike or not alike:
-        return 0, None, FITTED
-    luts = float(np.dot(fit, _terms(c)))
-    clock = (
-        median(a["median"] for a in alike),
-        min(a["least"] for a in alike),
-        max(a["most"] for a in alike),
-    )
-    return round(luts), clock, FITTED
-
-
-def _terms(c: Configuration) -> tuple[float, float]:
-    """What LUTs grow with: what surrounds the networks, and multipliers with their sums."""
-    return 1.0, float(_multipliers(c))
-
-
-def _fit(ours: Sequence[Mapping[str, Any]], source: Source, precision: Precision) -> tuple[list[float], float]:
-    """Least squares, and the largest leave-one-out error."""
-    if len(ours) < 4:
-        raise ValueError(
-            f"{len(ours)} routed ECP5 cores of this model in {precision}: expected 4 or more to fit others"
-        )
-    terms = np.array([_terms(_configuration(r, source, precision)) for r in ours])
-    luts = np.array([float(r["utilisation"]["luts"]["used"]) for r in ours])
-    errors = []
-    for n in range(len(ours)):
-        others = np.arange(len(ours)) != n
-        without = np.linalg.lstsq(terms[others], luts[others], rcond=None)[0]
-        errors.append(abs(float(terms[n] @ without) - luts[n]) / luts[n])
-    return [float(x) for x in np.linalg.lstsq(terms, luts, rcond=None)[0]], float(max(errors))
+def _fitted(part: str, c: Configuration, fit: LutFit) -> tuple[int, Clock | None, str]:
+    return (fit.luts(c), fit.clock_mhz, FITTED) if fit.covers(part, c) else (0, None, FITTED)

@@ -20,7 +20,7 @@ from .beats import U8, U16, image_beats
 from .core import RtlCore, Traffic
 from .simulators import sources
 
-__all__ = ["Activity", "Toggles", "measure_activity", "read_saif"]
+__all__ = ["Activity", "Toggles", "idle_toggles", "measure_activity", "read_saif"]
 
 TOP = "upb_core"
 CLOCKS = ("aclk", "clk")
@@ -81,6 +81,27 @@ def measure_activity(
         run = core.run(image_beats(distance, intensity, width), width, traffic, trace=path)
         parts = read_saif(path)
     return Activity(run.clocks, parts)
+
+
+_IDLE_FROM, _IDLE_CLOCKS = 100, 192 * 96
+_IDLE_COLUMNS = 32
+"""Enough to fill what the core holds, before it waits."""
+
+
+def idle_toggles(
+    source: Source, precision: Precision, distance: U16, intensity: U8, *, fold: int | None = None, lanes: int = 1
+) -> float:
+    """Toggles a clock of a core that waits with empty slots: the schedule runs on and reads its weights. From two runs
+    of a few columns whose sink takes nothing for a while, in one twice as long."""
+    image = distance[:, :_IDLE_COLUMNS], intensity[:, :_IDLE_COLUMNS]
+    runs = [
+        measure_activity(
+            source, precision, *image, fold=fold, lanes=lanes,
+            traffic=Traffic(stuck=(_IDLE_FROM, _IDLE_FROM + times * _IDLE_CLOCKS)),
+        )
+        for times in (1, 2)
+    ]  # fmt: skip
+    return (runs[1].toggles - runs[0].toggles) / (runs[1].clocks - runs[0].clocks)
 
 
 _TOKEN = re.compile(r"\(INSTANCE\s+(\S+)|\((\S+)\s+(?:\(T\w \d+\)\s*)+\(TC (\d+)\)\)|[()]")

@@ -69,16 +69,21 @@ class FpgaCore:
         mhz, slow, fast = clock.span("MHz")
         cycles = self.frame_cycles(columns)
         source = f"{cycles} cycles (LANES {self.lanes}, FOLD {self.fold}), as simulated; clock: {clock.source}"
-        return Figure(cycles / mhz / 1e3, cycles / fast / 1e3, cycles / slow / 1e3, "ms", "modelled", source)
+        kind = "simulated" if clock.kind == "simulated" else "modelled"
+        return Figure(cycles / mhz / 1e3, cycles / fast / 1e3, cycles / slow / 1e3, "ms", kind, source)
 
 
-def smallest_core(multipliers: int, hidden: int, share: float = 0.8) -> FpgaCore:
+def smallest_core(
+    multipliers: int, hidden: int, share: float = 0.8, *, precision: Precision = "int8", known: int | None = None
+) -> FpgaCore:
     """One lane, both networks, with the least ``fold`` above 1 whose multipliers fit in ``share`` of those there are,
-    or in the eight of the smallest parts. Raises FpgaCoreError where not even one multiplier is free for each
+    or in the eight of the smallest parts. ``known``: no more of them than this, the most of a core whose LUTs are
+    known. Raises FpgaCoreError where not even one multiplier is free for each
     network."""
     usable = max(min(multipliers, 8), int(multipliers * share))
+    usable = usable if known is None else min(usable, known)
     for fold in (f for f in folds(hidden) if f > 1):
-        core = FpgaCore(1, fold, hidden)
+        core = FpgaCore(1, fold, hidden, precision)
         if core.multipliers <= usable:
             return core
     raise FpgaCoreError(f"{multipliers} multipliers: a core of both networks needs at least 2 in {share:.0%} of them")

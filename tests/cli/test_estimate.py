@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from upbeam.cli.common import binary_bytes
 from upbeam.cli.main import run
+from upbeam.hw_sim.fpga.baselines import baselines
 
 KEYS = {"value", "low", "high", "kind", "boundary", "source"}
 
@@ -53,6 +55,41 @@ def test_our_load_in_words_and_as_json(upbeam, as_json):
     assert "What dominates" in text
 
 
+def test_an_fpga_core_as_routed(upbeam, as_json):
+    """LUTs and clock of the baselines, energy of switching activity; the chip at rest stays an assumption."""
+    found = as_json("estimate", "--device", "ecp5-25")
+    routed = baselines()["hdl-64e-int8-ecp5-25-f12"]
+    luts = found["memory"]["luts"]
+    assert (luts["value"], luts["kind"], luts["label"]) == (
+        routed["utilisation"]["luts"]["used"], "simulated", "routed (nextpnr)"
+    )  # fmt: skip
+    assert found["latency_ms"]["kind"] == "simulated"
+    assert found["increment_mj"]["kind"] == "modelled"
+    assert "no glitches" in found["increment_w"]["source"]
+    assert found["power_w"]["kind"] == "assumption"
+    assert any("misses glitches" in note for note in found["notes"])
+    assert as_json("estimate", "--device", "ecp5-85")["memory"]["luts"]["label"] == "fitted"
+    other = as_json("estimate", "--device", "ecp5-25", "--precision", "int16", "--fold", 8)
+    assert other["memory"]["luts"]["label"] == other["increment_w"]["kind"] == "assumption"
+    assert "in int16, LANES 1, FOLD 8" in other["workload"]
+
+
+def test_memory_has_units(upbeam):
+    text = " ".join(upbeam("estimate", "--device", "jetson-nano").split())
+    assert "weights 368 B, tables 2.94 KiB" in text
+    assert "memory of the device 4 GiB." in text
+    text = " ".join(upbeam("estimate", "--device", "ice40up5k").split())
+    assert "8704 of 1171456 bits of RAM" in text
+    assert "routed (nextpnr" in text
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(0, "0 B"), (1023, "1023 B"), (1024, "1 KiB"), (3 << 20, "3 MiB"), (4.0 * 2**30, "4 GiB")]
+)
+def test_bytes_in_binary_prefixes(count, text):
+    assert binary_bytes(count) == text
+
+
 def test_a_users_device(tmp_path, upbeam, as_json):
     shipped = Path(__file__).parents[2] / "power" / "devices" / "ecp5-25.toml"
     mine = tmp_path / "mine.toml"
@@ -85,7 +122,7 @@ def test_calibration_shows_before_and_after(tmp_path, as_json):
         (["--device", "ecp5-25", "--latency-ms", "3"], "--latency-ms goes with --macs"),
         (["--device", "ecp5-25", "--measure", "20"], "--measure goes with --device host"),
         (["--device", "ecp5-25", "--report", "x"], "--report goes with --all"),
-        (["--device", "ecp5-25", "--lanes", "40"], "lanes 40, expected 1 to 31"),
+        (["--device", "ecp5-25", "--lanes", "40"], "LANES 40 does not divide FOLD 1"),
         (["--device", "jetson-nano", "--calibrate", "/nowhere.log"], "/nowhere.log: No such file"),
         (["--device", "jetson-nano", "--rate", "0"], "--rate 0"),
     ],

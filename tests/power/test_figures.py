@@ -56,7 +56,7 @@ def test_conversions_that_cannot_be():
         ((1.0, 1.0, math.inf, "W", "measured", "x"), "finite"),
         ((None, None, None, "W", "measured", "x"), "kind 'none'"),
         ((1.0, 1.0, 1.0, "W", "none", "x"), "kind 'none'"),
-        ((1.0, 1.0, 1.0, "V", "measured", "x"), "unit 'V'"),
+        ((1.0, 1.0, 1.0, "kV", "measured", "x"), "unit 'kV'"),
     ],
 )
 def test_refused(arguments, message):

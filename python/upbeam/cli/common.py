@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-__all__ = ["JsonOption", "UserError", "emit_json", "message", "progress_bar", "show", "table"]
+__all__ = ["JsonOption", "UserError", "binary_bytes", "emit_json", "message", "progress_bar", "show", "table"]
 
 out = Console()
 err = Console(stderr=True)
@@ -74,3 +74,12 @@ def progress_bar(what: str, total: int, *, quiet: bool = False) -> Iterator[Any]
         if not (quiet or err.is_terminal):
             message(f"{what} ({total}) ...")
         yield advance
+
+
+def binary_bytes(count: float) -> str:
+    """``count`` bytes as B, KiB, MiB or GiB."""
+    size, unit = next(((s, u) for s, u in _BINARY if count >= s), (1, "B"))
+    return f"{count / size:.4g} {unit}" if unit == "B" else f"{count / size:.3g} {unit}"
+
+
+_BINARY = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,7 +27,8 @@ from upbeam.power.host import estimate_host
 from upbeam.power.ops import count_model
 from upbeam.runtime.upsampler import PRECISIONS, Model, load_model
 
-from .common import JsonOption, UserError, emit_json, err, message, show, table
+from .common import JsonOption, UserError, binary_bytes, emit_json, err, message, show, table
+from .fpga import built_cores, show_sweep, synthesise
 
 __all__ = ["estimate", "load_of"]
 
@@ -74,13 +75,9 @@ def estimate(
 ) -> None:
     """Latency, power and energy of our load, or of any workload, on a device: modelled, with the error beside it."""
     if fpga_sweep:
-        from .fpga import show_sweep
-
         show_sweep(load_model(model), precision, rate, report, as_json)
         return
     if build:
-        from .fpga import synthesise
-
         synthesise(load_model(model), str(device), precision, fold, lanes or 1, seeds, as_json)
         return
     _check(device, every, macs, latency_ms, report, log, measure, list_devices or errors or validate_cpu)
@@ -115,8 +112,12 @@ def estimate(
         with err.status("measuring ...") as status:
             one = estimate_host(chosen, load, loaded, measure_s=measure, advance=status.update)
     else:
-        core = None if lanes is None and fold is None else FpgaCore(lanes or 1, fold or 1, load.count.folded_hidden)
-        one = estimate_load(chosen, load, known=known, implementation=on, mode=mode, core=core)
+        core = None
+        if lanes is not None or fold is not None:
+            core = FpgaCore(lanes or 1, fold or 1, load.count.folded_hidden, load.fpga_precision)
+        one = estimate_load(
+            chosen, load, known=known, implementation=on, mode=mode, core=core, built=built_cores(loaded)
+        )
     if as_json:
         emit_json({**one.as_dict(), "model_crc32": f"{loaded.crc32:08x}"})
     else:
@@ -185,7 +186,7 @@ def _sentences(one: Estimate) -> list[str]:
     if one.sensors is not None:
         lines.append(f"Sensors that fit: {one.sensors[0]} ({one.sensors[1]} to {one.sensors[2]}).")
     if one.memory:
-        lines.append("Memory: " + ", ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in one.memory.items()) + ".")
+        lines.append(memory_line(one.memory))
     lines += [f"What dominates: {one.dominates}.", _error_line(one)]
     for name, bounded in (("Latency", one.latency_ms), ("Power", one.power_w)):
         boundary = f", {bounded.boundary}" if bounded.figure.known else ""
@@ -226,10 +227,20 @@ def _short(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 1e4 else f"{value:.4g}"
 
 
-def _text(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"{value['value']:.0f} ({value['low']:.0f} to {value['high']:.0f}, {value['kind']})"
-    return str(value) if not isinstance(value, float) else f"{value:.4g}"
+def memory_line(memory: Mapping[str, Any]) -> str:
+    """Bytes with binary prefixes; of an FPGA what of the part is used, bits named."""
+    if "luts_of" in memory:
+        luts = memory["luts"]
+        interval = "" if luts["low"] == luts["high"] else f", {luts['low']:.0f} to {luts['high']:.0f}"
+        how = f"assumption: {luts['source']}" if luts["kind"] == "assumption" else luts["source"]
+        return (
+            f"Memory: {memory['ram_bits']} of {memory['ram_bits_of']} bits of RAM. "
+            f"LUTs: {luts['value']:.0f} of {memory['luts_of']} ({100 * luts['value'] / memory['luts_of']:.0f} %"
+            f"{interval}; {how}). "
+            f"Multipliers: {memory['multipliers']} of {memory['multipliers_of']}. Fits: {memory['fits']}."
+        )
+    names = {"bytes": "moved a frame", "of": "memory of the device"}
+    return "Memory: " + ", ".join(f"{names.get(k, k)} {binary_bytes(v)}" for k, v in memory.items()) + "."
 
 
 # ------------------------------------------------------------------------------------------------------ all devices
@@ -244,7 +255,7 @@ def estimates_of_all(model: Model, load: Load, known: Knowledge) -> list[Estimat
             if chosen.family == "host":
                 found.append(estimate_host(chosen, load, model))
             else:
-                found.append(estimate_load(chosen, load, known=known, implementation=way))
+                found.append(estimate_load(chosen, load, known=known, implementation=way, built=built_cores(model)))
     return found
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from upbeam.hw_sim.fpga.activities import activities
 from upbeam.hw_sim.fpga.baselines import baselines
 from upbeam.hw_sim.fpga.flow import PARTS, run_flow
 from upbeam.hw_sim.fpga.simulators import cache_folder
+from upbeam.power.fpga_built import BuiltCores
 from upbeam.power.fpga_sweep import ROUTED, Point, Sweep, sweep
 from upbeam.power.ops import count_model
 from upbeam.quant.export.source import Source
@@ -16,7 +18,12 @@ from upbeam.runtime.upsampler import Model
 
 from .common import UserError, emit_json, message, show, table
 
-__all__ = ["show_sweep", "synthesise"]
+__all__ = ["built_cores", "show_sweep", "synthesise"]
+
+
+def built_cores(model: Model) -> BuiltCores:
+    """What this package's baselines know of a model's cores."""
+    return BuiltCores.of(model.crc32, baselines(), activities())
 
 
 def synthesise(
@@ -61,7 +68,8 @@ def show_sweep(model: Model, precision: str, rate_hz: float, report: Path | None
     source = Source.of(model.data, model.name)
     count = count_model(model.file, model.columns)
     try:
-        found = sweep(source, _integer(precision), baselines(), 2 * count.macs_folded * count.windows, rate_hz)
+        macs = 2 * count.macs_folded * count.windows
+        found = sweep(source, _integer(precision), baselines(), macs, rate_hz, activities())
     except ValueError as error:
         raise UserError(f"--fpga-sweep: {error}; shipped baselines are of hdl-64e in int8") from None
     if report is not None:
@@ -77,7 +85,8 @@ def show_sweep(model: Model, precision: str, rate_hz: float, report: Path | None
     show(table("Cores that no other of their part beats in LUTs and frames", head, rows))
     message(
         f"Clocks: simulated. LUTs and clock: routed, or fitted to routed cores (largest error of a core left out: "
-        f"{100 * found.fit_error:.0f} %). Energy: modelled, chip at rest included."
+        f"{100 * found.fit_error:.0f} %). Energy: modelled, of switching activity where it was simulated, of "
+        "multiply-accumulates elsewhere; chip at rest (assumed) included."
     )
     message(found.sentence())
 

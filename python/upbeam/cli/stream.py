@@ -21,6 +21,7 @@ from upbeam.runtime.upsampler import CPUS, PRECISIONS, Model, load_model
 
 from .common import JsonOption, UserError, emit_json, message, progress_bar, show, table
 from .estimate import load_of
+from .fpga import built_cores
 from .sources import simulated_scans
 
 __all__ = ["stream"]
@@ -93,8 +94,9 @@ def stream(
     if target is not None:
         load = load_of(loaded, precision, None, rate, deadline_ms)
         deployed = target_service(
-            find_device(target), load, config.columns_per_packet, mode=mode, service=service, seed=seed
-        )
+            find_device(target), load, config.columns_per_packet, mode=mode, service=service, seed=seed,
+            built=built_cores(loaded),
+        )  # fmt: skip
         config = replace(config, service_column_us=None, service_us=deployed.service_us)
     feed = _feed(source, loaded, sensor, any_sensor, frames, rate, seed, quiet=as_json)
     result = _play(feed, loaded, config, quiet=as_json)
