@@ -135,9 +135,10 @@ def _cells(bounded: Bounded, unit: str) -> dict[str, Any]:
 def _memory(memory: Mapping[str, Any]) -> str:
     if "luts_of" in memory:
         luts = memory["luts"]
+        interval = "" if luts["low"] == luts["high"] else f" ({luts['low']:.0f} to {luts['high']:.0f})"
         return (
-            f"{memory['multipliers']} of {memory['multipliers_of']} multipliers; {luts['value']:.0f} "
-            f"({luts['low']:.0f} to {luts['high']:.0f}) of {memory['luts_of']} LUTs ({luts['label']}); "
+            f"{memory['multipliers']} of {memory['multipliers_of']} multipliers; {luts['value']:.0f}{interval} "
+            f"of {memory['luts_of']} LUTs, {luts['label']}; "
             f"{memory['ram_bits'] / 8:.0f} B of RAM. Fits: {memory['fits']}"
         )
     if "bytes" in memory:
