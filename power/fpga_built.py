@@ -50,10 +50,12 @@ class LutFit:
     @classmethod
     def of(cls, reports: Sequence[Report], hidden: int) -> LutFit:
         """``reports``: of one model and precision, any part. Raises ValueError where fewer than four tell."""
-        ours = [r for r in reports if r["part"].startswith(FITTED_FAMILY) and r["fold"] > 1 and "clock_mhz" in r]
-        if len(ours) < _LEAST_REPORTS:
-            raise ValueError(f"{len(ours)} routed ECP5 cores: expected {_LEAST_REPORTS} or more to fit others")
-        terms = np.array([_terms(Configuration(hidden, r["fold"], r["lanes"])) for r in ours])
+        made = [(r, Configuration(hidden, r["fold"], r["lanes"])) for r in reports if "clock_mhz" in r]
+        alike = [(r, c) for r, c in made if _is_fitted(r["part"], c)]
+        if len(alike) < _LEAST_REPORTS:
+            raise ValueError(f"{len(alike)} routed ECP5 cores: expected {_LEAST_REPORTS} or more to fit others")
+        ours = [r for r, _ in alike]
+        terms = np.array([_terms(c) for _, c in alike])
         luts = np.array([float(r["utilisation"]["luts"]["used"]) for r in ours])
         errors = []
         for n in range(len(ours)):
@@ -69,14 +71,18 @@ class LutFit:
         return cls((fixed, each), float(max(errors)), clock, most, len(ours))
 
     def covers(self, part: str, c: Configuration) -> bool:
-        """ECP5 with multipliers only, no more of them than a routed core has, and lanes of whole hidden units: what
-        shares multipliers within several lanes, shifts and adds, and other families, are known as routed or not at
-        all."""
-        unlike = c.fold == 1 or (c.phases > 1 and c.lanes > 1)
-        return part.startswith(FITTED_FAMILY) and not unlike and multipliers_of(c) <= self.most_multipliers
+        """Nothing is extrapolated: no more multipliers than a routed core has."""
+        return _is_fitted(part, c) and multipliers_of(c) <= self.most_multipliers
 
     def luts(self, c: Configuration) -> int:
         return round(float(np.dot(self.coefficients, _terms(c))))
+
+
+def _is_fitted(part: str, c: Configuration) -> bool:
+    """ECP5 with multipliers, and lanes of whole hidden units. Other families, shifts and adds, and what shares
+    multipliers within several lanes (31 % more LUTs than the fit says, routed once) are known as routed or not at
+    all."""
+    return part.startswith(FITTED_FAMILY) and c.fold > 1 and (c.phases == 1 or c.lanes == 1)
 
 
 def _terms(c: Configuration) -> tuple[float, float]:

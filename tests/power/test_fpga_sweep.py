@@ -77,7 +77,7 @@ def test_the_sentence(found, source):
 
 
 def test_too_few_routed_cores_are_refused(source):
-    with pytest.raises(ValueError, match=r"in int16: 0 routed ECP5 cores: expected 4 or more"):
+    with pytest.raises(ValueError, match=r"in int16: 1 routed ECP5 cores: expected 4 or more"):
         sweep(source, "int16", baselines(), MACS)
 
 
