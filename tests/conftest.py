@@ -46,8 +46,11 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """What passed tests printed: measured figures, seeds, counts. (Failed ones show theirs anyway.)"""
-    printed = [r for r in terminalreporter.getreports("passed") if r.when == "call" and r.capstdout.strip()]
+    """What passed tests printed: measured figures, seeds, counts. (Failed ones show theirs anyway.)
+
+    Not of tests that run pytest themselves: their summaries, failures they mean included, would be taken for ours."""
+    passed = [r for r in terminalreporter.getreports("passed") if r.when == "call" and r.capstdout.strip()]
+    printed = [r for r in passed if "test session starts" not in r.capstdout]
     if printed:
         terminalreporter.section("printed by the tests")
     for report in printed:
