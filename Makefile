@@ -30,7 +30,7 @@ $(VENV)/.tools: pyproject.toml
 	@echo "== setting up $(VENV) (once; packages are downloaded)"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "upbeam needs Python 3.10 or newer, this is " + sys.version.split()[0])'
 	@$(PYTHON) -m venv $(VENV) || { echo "no venv module: install python3-venv"; exit 1; }
-	@$(PIP) "scikit-build-core>=0.11" "nanobind>=2.4" "cmake>=3.26" "ninja>=1.11"
+	@$(PIP) "scikit-build-core>=0.11" "nanobind>=2.4" "cmake>=3.26" "ninja>=1.11" "setuptools>=70.1" # the last: of packages without a wheel (cobs)
 	@touch $@
 
 $(VENV)/.installed: $(VENV)/.tools $(NATIVE)
