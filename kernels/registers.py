@@ -11,10 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from upbeam.model.toml_file import parse_toml
 
 __all__ = [
     "Field",
@@ -84,8 +81,8 @@ class RegisterMap:
 
 
 def read_map(text: str | None = None) -> RegisterMap:
-    """The packaged map, or one in TOML. Raises RegisterMapError."""
-    data = tomllib.loads(SOURCE.read_text(encoding="utf-8") if text is None else text)
+    """The packaged map, or one in TOML. Raises RegisterMapError, TomlError."""
+    data = parse_toml(SOURCE.name, SOURCE.read_text(encoding="utf-8") if text is None else text)
     head = data["map"]
     registers = tuple(_register(item) for item in data["register"])
     found = RegisterMap(

@@ -7,13 +7,14 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from upbeam.model.toml_file import TomlError, parse_toml
+
 from .catalogue import CatalogueError, Device
 from .energy import Row
 from .estimate import Estimate, Knowledge, Load, estimate_load, estimate_macs
 from .figures import Figure
 from .measure.rails import MeasureError, Recording
 from .measure.tegrastats import read_log
-from .toml_file import TomlError, parse_toml
 
 __all__ = ["Calibration", "Work", "calibrate", "read_rows", "write_rows"]
 

@@ -17,9 +17,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from upbeam.model.toml_file import TomlError, parse_toml
+
 from .cycles.cpu import CpuCore
 from .figures import UNITS, Figure, FigureError
-from .toml_file import TomlError, packaged, parse_toml
+from .files import packaged
 
 __all__ = ["CatalogueError", "Device", "Mode", "cpu_core", "device", "device_names", "read_device"]
 

@@ -19,10 +19,12 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
+from upbeam.model.toml_file import parse_toml
+
 from . import catalogue
 from .catalogue import CatalogueError
 from .figures import Figure
-from .toml_file import packaged, parse_toml
+from .files import packaged
 
 __all__ = [
     "EnergyModel",

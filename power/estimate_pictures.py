@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .estimate import Estimate
+from .files import packaged
 from .pictures import GENERATED, GRID, MEASURED, _figure, _plain_ticks, _styled
-from .toml_file import packaged
 
 __all__ = ["Roof", "RooflinePoint", "pareto_rows", "plot_latency", "plot_pareto", "plot_power", "plot_roofline"]
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from upbeam.hw_sim.faults.toml import read_toml
+from upbeam.model.toml_file import read_toml
 from upbeam.runtime.daemon import check_names
 
 from .bench import run_scenario

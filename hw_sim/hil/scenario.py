@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from upbeam.hw_sim.faults import DeviceFault, Fault, make_fault
-from upbeam.hw_sim.faults.toml import read_toml
 from upbeam.hw_sim.sensor import SensorConfig
+from upbeam.model.toml_file import read_toml
 
 __all__ = [
     "ACTIONS", "REACTIONS", "Action", "Expectation", "ExpectedFault", "ExpectedReaction", "Scenario", "ScenarioError",

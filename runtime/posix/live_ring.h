@@ -2,11 +2,10 @@
 #ifndef UPBEAM_LIVE_RING_H
 #define UPBEAM_LIVE_RING_H
 
-#include <stdatomic.h>
 #include <stddef.h>
 #include <stdint.h>
 
-#define LIVE_CACHE_LINE 64u
+#include "spsc.h"
 
 /* A packet's header; its columns follow in the slot, distances first. */
 typedef struct live_packet {
@@ -22,11 +21,8 @@ typedef struct live_ring {
     live_packet *packets; /* [capacity] */
     uint16_t *distance;   /* [capacity][columns_per_packet][UPB_BEAMS] */
     uint8_t *intensity;
-    uint32_t capacity; /* a power of two */
     uint32_t columns_per_packet;
-    /* Each index is written by one side alone; a line of its own keeps the other side's reads from slowing it. */
-    _Alignas(LIVE_CACHE_LINE) _Atomic uint64_t head; /* packets put in */
-    _Alignas(LIVE_CACHE_LINE) _Atomic uint64_t tail; /* packets released */
+    spsc index;
 } live_ring;
 
 /* 0 if the heap is exhausted; live_ring_free is then still to be called. */

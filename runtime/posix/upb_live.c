@@ -223,7 +223,7 @@ upb_live_status upb_live_create(const upb_model *model, const upb_live_config *c
     upb_live_status status = check_limits(config, e);
     if (status != UPB_LIVE_OK)
         return status;
-    upb_live *l = aligned_alloc(LIVE_CACHE_LINE, sizeof *l); /* the ring's indices ask for it */
+    upb_live *l = aligned_alloc(SPSC_CACHE_LINE, sizeof *l); /* the ring's indices ask for it */
     if (l == NULL)
         return UPB_LIVE_E_MEMORY;
     memset(l, 0, sizeof *l);

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from upbeam.power.catalogue import CatalogueError, cpu_core, device, device_names, read_device
-from upbeam.power.toml_file import packaged
+from upbeam.power.files import packaged
 
 EXPECTED = {
     "jetson-nano", "jetson-tx2", "jetson-xavier-nx", "jetson-agx-xavier", "jetson-orin-nano", "jetson-orin-nx",

@@ -9,8 +9,8 @@ from typing import Any
 
 from upbeam.hw_sim import simulate_frames
 from upbeam.hw_sim.faults import Fault, apply_faults, make_fault
-from upbeam.hw_sim.faults.toml import read_toml
 from upbeam.hw_sim.sensor import SENSORS, RecordedSensor, ScanLoop, SensorConfig, SimulatedSensor, send_udp
+from upbeam.model.toml_file import read_toml
 from upbeam.runtime.packets import Datagram, PcapWriter
 
 from .common import UserError
@@ -42,7 +42,7 @@ def send_packets(settings: PacketSettings, address: str) -> dict[str, Any]:
     """Sends ``frames`` turns to HOST:PORT in real time; how many packets, and how late."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise UserError(f"--udp {address}: expected HOST:PORT")
+        raise UserError(f"--udp {address}: expected HOST:PORT, a port from 1 to 65535")
     stream, name = _stream(settings)
     report = send_udp(stream, host, int(port))
     return {"sensor": name, "frames": settings.frames, "to": address, **vars(report)}

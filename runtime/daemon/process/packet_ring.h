@@ -2,11 +2,11 @@
 #ifndef UPBEAMD_PACKET_RING_H
 #define UPBEAMD_PACKET_RING_H
 
-#include <stdatomic.h>
 #include <stddef.h>
 #include <stdint.h>
 
-#define RING_CACHE_LINE 64u
+#include "spsc.h"
+
 #define RING_DATAGRAM_MAX 1500u /* what is longer is cut: no packet of a sensor is */
 
 typedef enum ring_kind { RING_DATA = 0, RING_POSITION = 1 } ring_kind;
@@ -21,11 +21,8 @@ typedef struct ring_datagram {
 
 typedef struct packet_ring {
     ring_datagram *slots; /* [capacity], of the caller */
-    uint32_t capacity;    /* a power of two */
-    /* Each index is written by one side alone; a line of its own keeps the other side's reads from slowing it. */
-    _Alignas(RING_CACHE_LINE) _Atomic uint64_t head; /* put in */
-    _Alignas(RING_CACHE_LINE) _Atomic uint64_t tail; /* released */
-    _Alignas(RING_CACHE_LINE) _Atomic uint64_t full; /* data packets that found no slot */
+    spsc index;
+    _Alignas(SPSC_CACHE_LINE) _Atomic uint64_t full; /* data packets that found no slot */
 } packet_ring;
 
 void packet_ring_init(packet_ring *ring, ring_datagram *slots, uint32_t capacity);

@@ -360,7 +360,7 @@ static int read_flags(settings *s, int argc, char **argv, int only_config, int *
         if (only_config && strcmp(key, "config") != 0)
             continue;
         if (!settings_set(s, key, value, problem, sizeof problem)) {
-            fprintf(stderr, "upbeamd: --%s\n", problem);
+            fprintf(stderr, "upbeamd: command line: %s\n", problem);
             return 0;
         }
     }
